@@ -1,5 +1,6 @@
 """Code symbols that change from pulse to pulse: tables, generators, frame numbers, and echoes of campaigns."""
 
+import json
 import tracemalloc
 from dataclasses import replace
 
@@ -7,17 +8,21 @@ import numpy as np
 import pytest
 import yaml
 import zarr
-from folders import complaint, small_simulation
+from folders import complaint, edit_config, expected_plan, small_simulation
 
 from apertura.campaign.folder import Campaign
 from apertura.core.echo.constellation import constellation
 from apertura.core.echo.frame_codes import Inverses, PnCodes, displacement, frame_numbers, pn_sequence
 from apertura.formats.code_tables import CodeTable
-from apertura.simulation import Impairments, simulate
+from apertura.simulation import Impairments, preset, simulate
 from apertura.simulation.continuous import Framing
 from apertura.stages import echo, ingest
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import budget_of
+from apertura.stages.scene import expected_scene
 from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import transmitted
+from apertura.views.plan import first_flight
 
 FRAMES, SUBCARRIERS = 5, 64
 
@@ -245,3 +250,71 @@ def test_codes_of_later_frames_are_found_and_corrected(tmp_path, pair):
     formed = transfer_of(changing, pair)
     assert "after" in formed.attrs["flags"]["frames_displaced"]
     np.testing.assert_array_equal(formed.transfer, expected.transfer)
+
+
+# ---- Plan and budget
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("code", ["qpsk", "64qam"])
+def test_plan_and_budget_state_the_loss_of_symbols_before_and_after_the_echo(tmp_path, code):
+    root = simulate(tmp_path / "campaign", changed_demo(code), seed=2)
+    campaign = Campaign.load(root)
+    before = expected_plan(campaign, "f01", "uav1-uav1")
+    ingest.ingest(campaign, "f01", "uav1")
+    echo.echo(campaign, "f01", "uav1-uav1")
+    campaign = Campaign.load(root)
+    after = expected_plan(campaign, "f01", "uav1-uav1")
+    decisions = [{item.name: item for item in plan.decisions}.get("symbol_filter") for plan in (before, after)]
+    ground = expected_scene(campaign, lambda: first_flight(campaign))
+    budget = budget_of(campaign, open_pair(campaign, "f01", "uav1-uav1"), ground)
+    stated = [line.stated for line in budget if line.cause == "data symbols"]
+    if code == "qpsk":
+        assert decisions == [None, None]
+        assert stated == []
+        return
+    assert decisions[0].value == "reciprocal"
+    assert decisions[0].reason.endswith("when they are formed; SNR loss 4.29 dB")
+    assert decisions[1].value == "wiener"
+    assert float(decisions[1].reason.split("SNR loss ")[1].removesuffix(" dB")) < 1
+    assert stated[0].startswith("wiener filter: SNR loss 0.")
+
+
+def changed_demo(code, *, snr_db=-5.0, frames=100):
+    plan = preset("demo", pulses=100)
+    own = Impairments(radar_snr_db=snr_db)
+    nodes = {"uav1": replace(plan.nodes["uav1"], impairments=own), "uav2": plan.nodes["uav2"]}
+    return replace(plan, nodes=nodes, waveform=replace(plan.waveform, code=code, frames=frames))
+
+
+@pytest.fixture(scope="module")
+def fixed_qpsk(tmp_path_factory):
+    """Transfer functions of the demo flight with a fixed QPSK code: without noise, and with an SNR of -5 dB."""
+    folder = tmp_path_factory.mktemp("fixed")
+    return [
+        scaled_transfer(simulate(folder / f"{snr_db}", changed_demo("qpsk", snr_db=snr_db, frames=1), seed=2))[0]
+        for snr_db in (None, -5.0)
+    ]
+
+
+def scaled_transfer(root):
+    """Return transfer functions in units of the simulation instead of counts, and the report on the symbols."""
+    stage = transfer_of(root, "uav1-uav1")
+    truth = json.loads((root / "truth.json").read_text())["flights"]["f01"]["nodes"]["uav1"]
+    return stage.transfer.values * truth["channels"]["radar"]["full_scale"], stage.attrs.get("symbols", {})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("symbol_filter", ["reciprocal", "matched", "auto"])
+@pytest.mark.parametrize("code", ["16qam", "64qam"])
+def test_noise_of_echoes_with_changing_symbols_equals_the_closed_form(fixed_qpsk, tmp_path, code, symbol_filter):
+    """Difference from the echoes of a fixed code without noise, relative to that of the fixed code with noise."""
+    root = simulate(tmp_path / "campaign", changed_demo(code), seed=2)
+    edit_config(root, lambda document: document.update(processing={"symbol_filter": symbol_filter}))
+    measured, symbols = scaled_transfer(root)
+    clean, noisy = fixed_qpsk
+    noise, reference = (np.mean(np.abs(some - clean) ** 2) for some in (measured, noisy))
+    assert 10 * np.log10(noise / reference) == pytest.approx(symbols["loss_db"], abs=0.1)
+    assert symbols["filter"] == ("wiener" if symbol_filter == "auto" else symbol_filter)
+    mean = np.vdot(clean, measured) / np.vdot(clean, clean)
+    assert abs(mean - 1) < 0.01

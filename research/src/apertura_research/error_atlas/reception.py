@@ -89,9 +89,9 @@ def processed(flown: TrueFlight, pair: str, received: Received) -> Received:
     """Remove tones, other interference and background as steps `echo` and `profile` do; return the raised flags."""
     transfer, frequency_hz, codes = received.transfer, flown.frequency_hz, flown.scene.waveform.codes
     weight, pulses = window_weights("hann", len(frequency_hz)), sampled_pulses(len(transfer))
-    tones = Tones.of(_numerology(flown), (1 / codes).astype(np.complex64))
-    tones.lines = tuple(_interference(transfer, frequency_hz, weight).lines)
-    transfer = np.asarray(tones.removed((transfer * codes).astype(np.complex64)) / codes, np.complex64)
+    tones = Tones(_numerology(flown), tuple(_interference(transfer, frequency_hz, weight).lines))
+    inverse = (1 / codes).astype(np.complex64)[None]
+    transfer = np.asarray(tones.removed((transfer * codes).astype(np.complex64), inverse) / codes, np.complex64)
     interference = _interference(transfer, frequency_hz, weight)
     flags = Flags.merged(tones.flags("interference"), interference.flags)
     if interference.is_removed:

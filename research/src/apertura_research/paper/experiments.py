@@ -73,7 +73,11 @@ class Experiment:
         time_s = receiver.log_seconds(receiver.raw.time.values)
         measured = transfer_by_code(
             receiver.reader(["radar"], every),
-            Demodulator(sent.inverse, receiver.numerology, sent.waveform.capture_samples),
+            Demodulator(
+                lambda pulses: sent.inverses.at(receiver.frames.numbers[pulses]),
+                receiver.numerology,
+                sent.waveform.capture_samples,
+            ),
             time_s=time_s,
         )
         history = self.history(BISTATIC, window)
