@@ -154,7 +154,7 @@ class SidelinkSymbols:
             "snr_db": round(decibels(self.snr), 2),
             "evm_db": round(float(20 * np.log10(decided.evm)), 2),
             "symbol_error_rate": float(f"{float(qam.symbol_error_rate(self.snr)):.2e}"),
-            "loss_db": round(float(20 * np.log10(max(gain, 1e-10))), 3),
+            "loss_db": round(float(20 * np.log10(max(gain, 1e-10))), 3) + 0.0,
             "error_db": round(divided_db if self.divides else decibels(decided.error), 2),
             "unsure": int((~usable).sum()),
         }
