@@ -33,7 +33,7 @@ from apertura.methods.interferometry.sensitivity import (
     Legs,
     Sensitivity,
     TrackPhase,
-    perpendicular_baseline,
+    baseline,
     sensitivity,
 )
 from apertura.stages.agreement import opened_layer
@@ -140,7 +140,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     ground = replace(ground, known=[height for height in heights if height is not None])
     middle = len(nodes_m) // 2 + lattice.shape[1] // 2 * (lattice.shape[0] % 2 == 0)
     at_middle = [(tx[middle], rx[middle]) for tx, rx in legs]
-    baseline_m = perpendicular_baseline(nodes_m[middle], scene.axes, *at_middle)
+    baseline_m, _ = baseline(nodes_m[middle], scene.axes, *at_middle)
     return TwoImages((first, second), (stages[0], stages[1]), ground, baseline_m, track_std_m)
 
 

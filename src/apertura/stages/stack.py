@@ -25,7 +25,7 @@ from apertura.formats.export import write_exports
 from apertura.methods.autofocus.inputs import TrackErrors
 from apertura.methods.interferometry.coherence import box_sum, chance, map_coherence, unbiased
 from apertura.methods.interferometry.heights import least_coherence
-from apertura.methods.interferometry.sensitivity import Sensitivity
+from apertura.methods.interferometry.sensitivity import Sensitivity, baseline
 from apertura.methods.stack.limits import FlightFit
 from apertura.methods.stack.residual_motion import (
     LEAST_WINDOWS,
@@ -421,20 +421,16 @@ def _baseline(
 ) -> dict[str, float | None]:
     """Return the baseline at the scene centre (docs/theory/stack.md, eq. 8) and the height of ambiguity."""
     row, column = (size // 2 for size in scene.grid.shape)
-    middles = []
+    legs = []
     for one in (reference, image):
-        place, at = one.places(scene, np.array([row]), np.array([column]))
-        middles.append(np.mean([antenna.position_m[0] for antenna in at], axis=0))
-    offset = middles[1].mean(axis=0) - middles[0].mean(axis=0)
-    along = middles[0][-1] - middles[0][0]
-    along /= max(float(np.linalg.norm(along)), 1e-9)
-    sight = middles[0].mean(axis=0) - place[0]
-    across = np.cross(sight, along)
-    across *= np.copysign(1.0, across @ scene.axes[2]) / max(float(np.linalg.norm(across)), 1e-9)
+        place, antennas = one.places(scene, np.array([row]), np.array([column]))
+        tx, rx = (antenna.position_m[0] for antenna in antennas)
+        legs.append((tx, rx))
+    perpendicular_m, along_m = baseline(place[0], scene.axes, *legs)
     ambiguity_m = np.inf if sensed is None else float(sensed.ambiguity_m[row, column])
     return {
-        "perpendicular_baseline_m": round(float(offset @ across), 4),
-        "along_track_offset_m": round(float(offset @ along), 4),
+        "perpendicular_baseline_m": round(perpendicular_m, 4),
+        "along_track_offset_m": round(along_m, 4),
         "height_of_ambiguity_m": round(ambiguity_m, 3) if ambiguity_m < _MOST_AMBIGUITY_M else None,
     }
 

@@ -136,8 +136,8 @@ def sensitivity(
     )
 
 
-def perpendicular_baseline(place_m: Floats, axes: Floats, first: Legs, second: Legs) -> float:
-    """Return the distance of two tracks perpendicular to the line of sight and to the first track, metres.
+def baseline(place_m: Floats, axes: Floats, first: Legs, second: Legs) -> tuple[float, float]:
+    """Return the distances of two tracks perpendicular to the line of sight and the first track, and along the track.
 
     Parameters
     ----------
@@ -150,21 +150,29 @@ def perpendicular_baseline(place_m: Floats, axes: Floats, first: Legs, second: L
 
     Returns
     -------
-    float
-        Positive if the second track lies on the upper side of the line of sight.
+    tuple of float
+        Perpendicular baseline, positive if the second track lies on the upper side of the line of sight, and offset
+        along the first track, metres.
+
+    Notes
+    -----
+    Source: docs/theory/stack.md, eq. 8.
 
     Examples
     --------
     >>> track = np.linspace(-4.0, 4.0, 9)[:, None] * [1.0, 0.0, 0.0] + [0.0, -20.0, 20.0]
-    >>> higher = track + [0.0, 0.0, 1.0]
-    >>> round(perpendicular_baseline(np.zeros(3), np.eye(3), (track, track), (higher, higher)), 3)
-    0.707
+    >>> higher = track + [0.5, 0.0, 1.0]
+    >>> [round(one, 3) for one in baseline(np.zeros(3), np.eye(3), (track, track), (higher, higher))]
+    [0.707, 0.5]
     """
     phase_centres = [(tx + rx) / 2 for tx, rx in (first, second)]
-    sight = phase_centres[0].mean(axis=0) - place_m
-    across = np.cross(sight, phase_centres[0][-1] - phase_centres[0][0])
+    middles = [centre.mean(axis=0) for centre in phase_centres]
+    along = phase_centres[0][-1] - phase_centres[0][0]
+    along = along / max(float(np.linalg.norm(along)), 1e-12)
+    across = np.cross(middles[0] - place_m, along)
     across *= np.copysign(1.0, across @ axes[2]) / max(float(np.linalg.norm(across)), 1e-12)
-    return float((phase_centres[1].mean(axis=0) - phase_centres[0].mean(axis=0)) @ across)
+    offset = middles[1] - middles[0]
+    return float(offset @ across), float(offset @ along)
 
 
 def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: list[Floats], height_m: Floats) -> Floats:
