@@ -122,7 +122,7 @@ def dolphin_config(
 
     A persistent scatterer keeps its own phase instead of that of its window. The amplitude dispersion of a pixel
     approximates the standard deviation σ of its phase, radians, which shall not exceed that of a window. The dispersion
-    D of n images is an estimate, (n - 1) D²/σ² being distributed as χ² with n - 1 degrees of freedom: the limit of D is
+    D of n images is an estimate, n D²/σ² being distributed as χ² with n - 1 degrees of freedom: the limit of D is
     the quantile at which 1 % of the pixels with the deviation of a window are selected by chance.
 
     Parameters
@@ -144,10 +144,10 @@ def dolphin_config(
     ...     5 * ["a.tif"], 0.25, window_px=15, stride=3, phase_std_rad=0.05, reference_point=(4, 5)
     ... )
     >>> config["phase_linking"]["half_window"], config["ps_options"]["amp_dispersion_threshold"]
-    ({'x': 7, 'y': 7}, 0.0136)
+    ({'x': 7, 'y': 7}, 0.0122)
     """
-    degrees = len(images) - 1
-    dispersion = min(_PS_DISPERSION, phase_std_rad * np.sqrt(chi2.ppf(_PS_CHANCE, degrees) / degrees))
+    count = len(images)
+    dispersion = min(_PS_DISPERSION, phase_std_rad * np.sqrt(chi2.ppf(_PS_CHANCE, count - 1) / count))
     return {
         "input_options": {"cslc_date_fmt": DATE_FORMAT, "wavelength": wavelength_m},
         "cslc_file_list": list(images),
