@@ -4,7 +4,7 @@ Tracks are 0, 0.1 and 1 m apart, logs have errors of 1 cm, and the slope moves b
 from flight to flight (preset `revisit`). For each flight the table lists the error of the removed phase, the standard
 deviation of the phase of windows on stable ground, the displacement error there, and the mean displacement of the slope
 against its true value. Run:
-`.venv/bin/python benchmarks/stack.py [--autofocus auto] [--seed 1] [OFFSET_M:SLOPE_MM …]`.
+`.venv/bin/python benchmarks/stack.py [--autofocus on] [--seed 1] [OFFSET_M:SLOPE_MM …]`.
 """
 
 import argparse
@@ -111,7 +111,7 @@ def main() -> None:
     """Run the cases of the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", default=CASES)
-    parser.add_argument("--autofocus", default="off", choices=("off", "auto"))
+    parser.add_argument("--autofocus", default="off", choices=("off", "auto", "on"))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, default=None, help="folder in which the campaigns are kept")
     arguments = parser.parse_args()

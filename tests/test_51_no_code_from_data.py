@@ -70,6 +70,7 @@ TYPED = {
     "step pictures-fused": "step pictures-fused f01",
     "step profile": "step profile f01 uav1-uav2",
     "step refine": "step refine f01",
+    "step stack-image": "step stack-image f01",
     "step tiles": "step tiles f01 uav1-uav2 1-of-2",
     "step tracks": "step tracks f01",
     "step transfer": "step transfer f01 uav1-uav2",
@@ -83,7 +84,10 @@ TYPED = {
 }
 """Command → command line in the campaign folder, if it has arguments."""
 
-MAY_REFUSE = {"align", "bench", "step bench", "reflectors", "step calibrate", "step interferogram", "step page"}
+MAY_REFUSE = {
+    *("align", "bench", "step bench", "reflectors", "step calibrate", "step interferogram", "step page", "step stack"),
+    "step stack-image",
+}
 """Commands whose requirements the tested campaign does not meet."""
 
 WORKFLOW_COMMANDS = {

@@ -15,7 +15,7 @@ from typing import Any
 # ---- Commands -------------------------------------------------------------------------------------------------------
 
 SAMPLE, PAIR, BENCH = "sample", "pair", "bench"
-"""Campaigns: one with every step; one with two flights, an interferogram and a reflector; and one with a bench
+"""Campaigns: one with every step; one with two flights, an interferogram, a stack and a reflector; and one with a bench
 recording.
 """
 
@@ -81,6 +81,8 @@ COMMANDS: dict[str, Command] = {
     "reproduce": Command("reproduce results/f01/uav1-uav1/db.tif", is_cold=True),
     **{f"step {words.split()[0]}": Command(f"step {words}") for words in _STEPS},
     "step interferogram": Command("step interferogram two", PAIR),
+    "step stack-image": Command("step stack-image f02", PAIR),
+    "step stack": Command("step stack", PAIR),
     "reflectors": Command("reflectors .", PAIR),
     "align": Command("align . f01 uav1 --point {point} --search-s 0.05 --write", PAIR, writes=("config/clocks.tsv",)),
     "bench": Command("bench .", BENCH, finished=False),
@@ -128,6 +130,7 @@ def make_campaign(folder: Path, name: str) -> None:
         ball = {"name": "ball", "kind": "sphere", "size_m": [0.5], "position_m": first_target(root), "std_m": 0.02}
         _edit(root, "scene", reflectors=[ball])
         _edit(root, "interferometry", pairs={"two": ["f01/uav1-uav1", "f02/uav1-uav1"]})
+        _edit(root, "stack", reference="f01", flights=["f02"], pair="uav1-uav1")
     else:
         lab = preset("paper-lab", pulses=60)
         simulate(root, replace(lab, flights=(replace(lab.flights[0], name="b01", kind="bench"),)))
