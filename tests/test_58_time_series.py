@@ -285,6 +285,10 @@ def test_campaign_without_a_stack_is_refused(tmp_path):
 def test_folder_without_a_result_of_dolphin_is_refused(tmp_path):
     with pytest.raises(CampaignError, match=r"handoff\.json.*Run `apertura export stack` first"):
         write_time_series(tmp_path)
+    for damaged in ("{}", '{"flights": [1, 2]}', '{"flights": []}'):
+        (tmp_path / "handoff.json").write_text(damaged)
+        with pytest.raises(CampaignError, match=r"no flights.*Run `apertura export stack` first"):
+            write_time_series(tmp_path)
     write_handoff(tmp_path, hours=24)
     with pytest.raises(CampaignError, match=r"a result of dolphin.*dolphin run dolphin_config\.yaml"):
         write_time_series(tmp_path)
