@@ -285,15 +285,27 @@ def test_campaign_without_a_stack_is_refused(tmp_path):
 def test_folder_without_a_result_of_dolphin_is_refused(tmp_path):
     with pytest.raises(CampaignError, match=r"handoff\.json.*Run `apertura export stack` first"):
         write_time_series(tmp_path)
+    for damaged in ("{}", '{"flights": [1, 2]}', '{"flights": []}'):
+        (tmp_path / "handoff.json").write_text(damaged)
+        with pytest.raises(CampaignError, match=r"no flights.*Run `apertura export stack` first"):
+            write_time_series(tmp_path)
     write_handoff(tmp_path, hours=24)
     with pytest.raises(CampaignError, match=r"a result of dolphin.*dolphin run dolphin_config\.yaml"):
         write_time_series(tmp_path)
 
 
-def test_persistent_scatterers_are_as_good_as_their_window():
-    """The amplitude dispersion of a pixel, about the deviation of its phase, is limited to that of its window."""
-    for std_rad, dispersion in ((0.02, 0.02), (0.8, 0.25)):
-        options = {"window_px": 15, "stride": 3, "phase_std_rad": std_rad, "reference_point": (0, 0)}
-        config = dolphin_config(["a.tif"], 0.25, **options)
-        assert config["ps_options"]["amp_dispersion_threshold"] == pytest.approx(dispersion)
+@pytest.mark.parametrize("flights", [3, 5, 20])
+def test_persistent_scatterers_are_as_good_as_their_window(flights):
+    """Of pixels with the deviation of the phase of a window, 1 % are selected by chance, with any number of flights.
+
+    The amplitude dispersion of dolphin is the standard deviation of the amplitudes, divided by their mean.
+    """
+    options = {"window_px": 15, "stride": 3, "reference_point": (0, 0)}
+    config = dolphin_config(flights * ["a.tif"], 0.25, phase_std_rad=0.1, **options)
+    amplitudes = 1 + 0.1 * np.random.default_rng(1).normal(size=(200_000, flights))
+    dispersion = amplitudes.std(axis=1) / amplitudes.mean(axis=1)
+    selected = (dispersion < config["ps_options"]["amp_dispersion_threshold"]).mean()
+    assert selected == pytest.approx(0.01, abs=0.002)
     assert config["phase_linking"]["half_window"] == {"x": 7, "y": 7}
+    noisy = dolphin_config(flights * ["a.tif"], 0.25, phase_std_rad=3.0, **options)
+    assert noisy["ps_options"]["amp_dispersion_threshold"] <= 0.25

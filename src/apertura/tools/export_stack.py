@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from rasterio import Affine
+from scipy.stats import chi2
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import check_listed, open_listed
@@ -35,6 +36,7 @@ _STRIDES_PER_WINDOW = 5
 """Output pixels of dolphin along the averaging window: neighbouring output pixels share most of their samples."""
 
 _PS_DISPERSION = 0.25  # default of dolphin: largest amplitude dispersion that approximates the phase deviation, rad
+_PS_CHANCE = 0.01  # probability that a pixel is selected whose dispersion is that of a window
 
 _HEIGHT = Band("float32", np.nan, "m", "terrain height in the CRS of the scene", "AVERAGE", smooth=True)
 _GOOD = Band("uint8", 255, "class", "1 valid in all flights of the stack, 0 invalid", "MODE")
@@ -119,7 +121,9 @@ def dolphin_config(
     """Return the configuration of dolphin's displacement workflow; options not listed keep their defaults.
 
     A persistent scatterer keeps its own phase instead of that of its window. The amplitude dispersion of a pixel
-    approximates the standard deviation of its phase, radians; it is limited to that of the phase of a window.
+    approximates the standard deviation σ of its phase, radians, which shall not exceed that of a window. The dispersion
+    D of n images is an estimate, n D²/σ² being distributed as χ² with n - 1 degrees of freedom: the limit of D is
+    the quantile at which 1 % of the pixels with the deviation of a window are selected by chance.
 
     Parameters
     ----------
@@ -137,19 +141,20 @@ def dolphin_config(
     Examples
     --------
     >>> config = dolphin_config(
-    ...     ["a.tif"], 0.25, window_px=15, stride=3, phase_std_rad=0.05, reference_point=(4, 5)
+    ...     5 * ["a.tif"], 0.25, window_px=15, stride=3, phase_std_rad=0.05, reference_point=(4, 5)
     ... )
     >>> config["phase_linking"]["half_window"], config["ps_options"]["amp_dispersion_threshold"]
-    ({'x': 7, 'y': 7}, 0.05)
+    ({'x': 7, 'y': 7}, 0.0122)
     """
-    dispersion = min(_PS_DISPERSION, phase_std_rad)
+    count = len(images)
+    dispersion = min(_PS_DISPERSION, phase_std_rad * np.sqrt(chi2.ppf(_PS_CHANCE, count - 1) / count))
     return {
         "input_options": {"cslc_date_fmt": DATE_FORMAT, "wavelength": wavelength_m},
         "cslc_file_list": list(images),
         "mask_file": "mask.tif",
         "work_directory": "dolphin",
         "output_options": {"strides": {"x": stride, "y": stride}},
-        "ps_options": {"amp_dispersion_threshold": round(dispersion, 4)},
+        "ps_options": {"amp_dispersion_threshold": round(float(dispersion), 4)},
         "phase_linking": {"half_window": {"x": window_px // 2, "y": window_px // 2}},
         "interferogram_network": {"max_bandwidth": 2},
         "unwrap_options": {"unwrap_method": "snaphu"},

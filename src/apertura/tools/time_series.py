@@ -70,7 +70,12 @@ class DolphinResult:
         """Open a folder; raise CampaignError if the stack or the result of dolphin is missing."""
         remedy = "Run `apertura export stack` first."
         handoff = read_json(folder / HANDOFF, expected="an exported stack", remedy=remedy)
-        times = tuple(one["time"] for one in handoff["flights"])
+        try:
+            times = tuple(str(one["time"]) for one in handoff["flights"])
+        except (KeyError, TypeError):
+            times = ()
+        if len(times) < 2:
+            raise CampaignError("no flights", folder / HANDOFF, "a file of `apertura export stack`", remedy)
         with opened_raster(folder / f"dolphin/timeseries/{times[0]}_{times[-1]}.tif", **_EXPECTED) as raster:
             return cls(folder, times, handoff, raster.profile)
 
