@@ -598,7 +598,7 @@ _OF_IMAGES = {
     "stack_flight_excluded": Flag(
         "reason: coherence, residual phase in rad, or fraction of the windows that follow one residual track",
         "the flight does not fit into the stack and is left out of its list of flights",
-        "tracks and focus of the flight; baseline; changes of the terrain; processing.autofocus",
+        "tracks and focus of the flight; baseline; changes of the terrain; processing.autofocus; stack.window_px",
         "methods/stack/limits.py",
     ),
     "stack_residual_phase": Flag(

@@ -304,6 +304,16 @@ def estimate_motion(phases: WindowPhases, design: Floats, constants: Floats, *, 
     Notes
     -----
     Source: docs/theory/stack.md, eqs. 5 and 6.
+
+    Examples
+    --------
+    The last of 40 windows moves by itself.
+
+    >>> design = np.random.default_rng(0).normal(size=(40, 3))
+    >>> phase = 0.5 + design @ [0.3, -0.2, 0.1] + np.append(np.zeros(39), 2.0)
+    >>> motion = estimate_motion(WindowPhases(np.exp(1j * phase), *np.full((4, 40), 0.1)), design, design, radius_m=1.0)
+    >>> round(motion.constant_rad, 1), motion.residual_rad[-1].round(1), int(motion.stable.sum())
+    (0.5, np.float64(2.0), 39)
     """
     if len(phases) < LEAST_WINDOWS:
         raise ValueError(f"{len(phases)} coherent windows; at least {LEAST_WINDOWS} are required")
