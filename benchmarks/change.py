@@ -258,7 +258,7 @@ def unchanged_table(scenes):
     """Print false alarms in scenes without a change against the requested rate."""
     print(f"{scenes} scenes without a change; pixels per test: false, expected; regions")
     print(
-        "apart m | errors m | rate | amplitude | coherence | regions: found, at most expected | scenes with a region | looks"
+        "apart m | errors m | rate | amplitude | coherence | regions: found, at most expected | scenes with one | looks"
     )
     for offset_m, error_m in ((0.0, 0.0), *((offset_m, ERROR_M) for offset_m in OFFSETS_M)):
         pairs = [scene(1000 + seed, offset_m, error_m=error_m)[:3] for seed in range(scenes)]
