@@ -256,10 +256,12 @@ def drawn(curves, path):
 
 def unchanged_table(scenes):
     """Print false alarms in scenes without a change against the requested rate."""
-    print(f"{scenes} scenes without a change, errors {ERROR_M} m; pixels per test: false, expected; regions")
-    print("apart m | rate | amplitude | coherence | regions: found, at most expected | scenes with a region | looks")
-    for offset_m in OFFSETS_M:
-        pairs = [scene(1000 + seed, offset_m)[:3] for seed in range(scenes)]
+    print(f"{scenes} scenes without a change; pixels per test: false, expected; regions")
+    print(
+        "apart m | errors m | rate | amplitude | coherence | regions: found, at most expected | scenes with one | looks"
+    )
+    for offset_m, error_m in ((0.0, 0.0), *((offset_m, ERROR_M) for offset_m in OFFSETS_M)):
+        pairs = [scene(1000 + seed, offset_m, error_m=error_m)[:3] for seed in range(scenes)]
         for rate in (1e-2, 1e-3, 1e-4):
             amplitude = coherent = regions = with_region = 0
             expected, limit, looks = 0.0, 0.0, []
@@ -272,7 +274,7 @@ def unchanged_table(scenes):
                 expected += rate / 2 * changes.valid
                 limit += rate * changes.tests(WINDOW)
                 looks.append(changes.looks)
-            print(f"{offset_m} | {rate:g} | {amplitude}, {expected:.0f} | {coherent}, {expected:.0f} | "
+            print(f"{offset_m} | {error_m} | {rate:g} | {amplitude}, {expected:.0f} | {coherent}, {expected:.0f} | "
                   f"{regions}, {limit:.1f} | {with_region} | {np.mean(looks):.1f}", flush=True)  # fmt: skip
 
 

@@ -116,7 +116,10 @@ def image_entry(
         "acquired": times,
         "licence": tags.get("TIFFTAG_COPYRIGHT"),
         "layers": [
-            {**asdict(layer), "url": url_of(f"{layer.folder or f'{flight}/{image}'}/{layer.file}", layer.sha256)}
+            {
+                **{name: value for name, value in asdict(layer).items() if name != "folder"},
+                "url": url_of(f"{layer.folder or f'{flight}/{image}'}/{layer.file}", layer.sha256),
+            }
             for layer in layers
         ],
     }
