@@ -115,6 +115,26 @@ def test_cube_has_the_metadata_of_acdd(campaign, opened):
     assert all(array.attrs["coverage_content_type"] for array in opened.data_vars.values())
 
 
+@pytest.mark.skipif(
+    tuple(map(int, rasterio.__gdal_version__.split(".")[:2])) < (3, 12), reason="GDAL 3.12 reads Zarr version 3"
+)
+@pytest.mark.parametrize("array", ["image:1:0", "overviews/2/power:1:0"])
+def test_gdal_reads_an_image_with_its_crs(campaign, opened, array):
+    with rasterio.open(f'ZARR:"{campaign.stage("cube")}":/{array}') as raster:
+        assert raster.crs.to_epsg() == 32632
+        assert tuple(raster.bounds) == pytest.approx(campaign.settings.scene.bounds_m, abs=1e-6)
+        if array.startswith("image"):
+            np.testing.assert_array_equal(raster.read(1), opened.image[1, 0])
+
+
+def test_codecs_of_the_cube_are_those_of_gdal(campaign):
+    """GDAL 3.12 supports bytes, vlen-utf8 and zstd, but not crc32c; zstd has a checksum."""
+    arrays = [json.loads(path.read_bytes()) for path in campaign.stage("cube").rglob("zarr.json")]
+    codecs = [codec for array in arrays for codec in array.get("codecs", [])]
+    assert {codec["name"] for codec in codecs} == {"bytes", "vlen-utf8", "zstd"}
+    assert all(codec["configuration"]["checksum"] for codec in codecs if codec["name"] == "zstd")
+
+
 def test_overviews_are_the_mean_power_of_blocks_of_pixels(campaign, opened):
     """Each level has its own grid, is valid as a level of the convention, and contains the sum, too."""
     power = (np.abs(opened.image.load()) ** 2).values

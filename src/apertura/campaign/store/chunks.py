@@ -34,6 +34,9 @@ zarr.config.set({"array.write_empty_chunks": True})  # write zeros, too, because
 CODECS = (ZstdCodec(), Crc32cCodec())
 """Codecs of a chunk; the checksum is last, so that it covers the bytes on disk."""
 
+EXCHANGED = (ZstdCodec(checksum=True),)
+"""Codecs of a stage that other programs read: GDAL (3.12) does not support crc32c; the checksum is that of zstd."""
+
 _SUM_BYTES = 4
 _METADATA = "zarr.json"
 
@@ -67,6 +70,7 @@ class StageStore(LocalStore):
     ) -> None:
         super().__init__(ConfinedPath.of(folder), read_only=read_only)
         self._finished_later = finished_later
+        self._without_crc = set[str]()
         self._unchecked = {key: digest for key, digest in (sha256 or {}).items() if _METADATA not in key}
 
     async def get(
@@ -113,14 +117,20 @@ class StageStore(LocalStore):
         name = key.rpartition("/")[2]
         if name.startswith(".z"):  # metadata of Zarr version 2 are not used, because filters may contain a pickle
             return None
-        if name == _METADATA and value is not None and other_codec(_json(value)) is not None:
-            raise damaged(self.root, key)
+        if name == _METADATA and value is not None:
+            metadata = _json(value)
+            if other_codec(metadata) is not None:
+                raise damaged(self.root, key)
+            if isinstance(metadata, dict) and '"crc32c"' not in json.dumps(metadata.get("codecs", [])):
+                self._without_crc.add(key.removesuffix(f"/{_METADATA}"))
         if value is None and key in self._unchecked:  # Zarr interprets a missing chunk as an empty chunk
             raise damaged(self.root, key)
         if value is None or byte_range is not None or name == _METADATA:
             return value
         content = value.as_numpy_array()
-        whole = google_crc32c.value(content[:-_SUM_BYTES]) == int.from_bytes(content[-_SUM_BYTES:].tobytes(), "little")
+        whole = key.removesuffix("/c").partition("/c/")[0] in self._without_crc or google_crc32c.value(
+            content[:-_SUM_BYTES]
+        ) == int.from_bytes(content[-_SUM_BYTES:].tobytes(), "little")
         expected = self._unchecked.get(key)
         if not whole or (expected is not None and expected != hashlib.sha256(content.data).hexdigest()):
             raise damaged(self.root, key)
@@ -156,7 +166,9 @@ def damaged(folder: Path, key: str) -> CampaignError:
     )
 
 
-def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashable, dict[str, Any]]:
+def encoding_of(
+    dataset: "xr.Dataset", chunks: Mapping[str, int], codecs: tuple[Any, ...] = CODECS
+) -> dict[Hashable, dict[str, Any]]:
     """Return the encoding of each variable of a stage.
 
     Parameters
@@ -165,10 +177,12 @@ def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashab
         Stage.
     chunks
         Dimension → chunk length; other dimensions have one chunk.
+    codecs
+        Codecs of the chunks.
     """
     encoding: dict[Hashable, dict[str, Any]] = {}
     for name, array in dataset.variables.items():
-        encoding[name] = {"compressors": CODECS}
+        encoding[name] = {"compressors": codecs}
         if array.ndim and array.size:
             encoding[name]["chunks"] = tuple(chunks.get(str(dim), size) for dim, size in array.sizes.items())
     if "time" in encoding:
@@ -208,13 +222,15 @@ def skeleton(
     groups
         Path of a group below the stage → its dataset and the chunks of its arrays, as `stage` and `chunks`.
     consolidated
-        True if the metadata of the stage contain those of all arrays, for readers that open several arrays.
+        True for a stage that other programs read: its metadata contain those of all arrays, and its chunks have the
+        codecs `EXCHANGED`.
     """
     files: dict[str, Buffer] = {}
     store = MemoryStore(files)
     for place, (dataset, shapes) in {"": (stage, chunks), **groups}.items():
         whole = dataset.drop_vars(list(shapes))
-        how: Any = {"consolidated": False, "zarr_format": 3, "encoding": encoding_of(whole, lengths)}
+        codecs = EXCHANGED if consolidated else CODECS
+        how: Any = {"consolidated": False, "zarr_format": 3, "encoding": encoding_of(whole, lengths, codecs)}
         whole.to_zarr(store, group=place or None, mode="a", **how)
         group = zarr.open_group(store, path=place, mode="r+")
         for name, shape in shapes.items():
@@ -224,7 +240,7 @@ def skeleton(
                 shape=array.shape,
                 chunks=shape,
                 dtype=array.dtype,
-                compressors=CODECS if packed else CODECS[-1:],
+                compressors=codecs if packed else codecs[-1:],
                 fill_value=array.values.flat[0],  # value of chunks that are never written
                 dimension_names=[str(dim) for dim in array.dims],
                 attributes=array.attrs | ({"grid_mapping": "spatial_ref"} if {"y", "x"} <= set(array.dims) else {}),
