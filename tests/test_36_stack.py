@@ -78,9 +78,7 @@ def estimated(phase_rad, *, std_m=0.014, noise_rad=0.05, seed=0, radius_m=0.05):
     tracks, _ = tracks_of([leg], std_m)
     antennas = [seen("uav1", leg)] * 2
     noise = np.random.default_rng(seed).normal(size=len(PLACES)) * noise_rad
-    phases = WindowPhases(
-        np.exp(1j * (phase_rad + noise)), np.full(len(PLACES), 0.95), NORTH, EAST, np.full(len(PLACES), noise_rad)
-    )
+    phases = WindowPhases(np.exp(1j * (phase_rad + noise)), NORTH, EAST, np.full(len(PLACES), noise_rad))
     design, constants = tracks.phase(PLACES, antennas), tracks.constant_phase(PLACES, antennas)
     motion = estimate_motion(phases, design, constants, radius_m=radius_m)
     model = design @ motion.unknowns + motion.constant_rad
@@ -138,7 +136,7 @@ def test_prior_is_widened_if_the_logs_are_worse_than_stated():
 
 
 def test_too_few_windows_are_refused():
-    few = WindowPhases(*(np.ones(LEAST_WINDOWS - 1) for _ in range(5)))
+    few = WindowPhases(*(np.ones(LEAST_WINDOWS - 1) for _ in range(4)))
     with pytest.raises(ValueError, match="11 coherent windows; at least 12"):
         estimate_motion(few, np.ones((11, 3)), np.ones((11, 3)), radius_m=0.1)
 

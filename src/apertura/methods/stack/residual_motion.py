@@ -24,8 +24,6 @@ class WindowPhases:
     ----------
     phasor
         (window,) complex128, Σ I₂ I₁* over the window.
-    coherence
-        (window,) float64, unbiased coherence.
     row, column
         (window,) float64, centroid of |I₂ I₁*|, pixels.
     std_rad
@@ -33,7 +31,6 @@ class WindowPhases:
     """
 
     phasor: NDArray[np.complex128]
-    coherence: Floats
     row: Floats
     column: Floats
     std_rad: Floats
@@ -66,8 +63,8 @@ class WindowPhases:
         >>> generator = np.random.default_rng(0)
         >>> image = (generator.normal(size=(8, 8)) + 1j * generator.normal(size=(8, 8))).astype(np.complex64)
         >>> phases = WindowPhases.of(image * 1j, image, np.ones((8, 8), bool), window=4, looks=16.0)
-        >>> np.angle(phases.phasor).round(3), phases.coherence.round(3)
-        (array([1.571, 1.571, 1.571, 1.571]), array([1., 1., 1., 1.]))
+        >>> np.angle(phases.phasor).round(3)
+        array([1.571, 1.571, 1.571, 1.571])
         """
         valid = used & np.isfinite(image) & np.isfinite(reference)
         one, other = (np.where(valid, pixels, 0).astype(np.complex128) for pixels in (image, reference))
@@ -91,7 +88,7 @@ class WindowPhases:
             keep = (magnitude > least_coherence(looks)) & (total(valid) > window**2 / 2)
         known = np.minimum(unbiased(magnitude[keep], looks), 0.9999) if keep.any() else magnitude[keep]
         std = phase_std(known.astype(np.float32), looks).astype(np.float64)
-        return cls(phasor[keep], known.astype(np.float64), row[keep], column[keep], std)
+        return cls(phasor[keep], row[keep], column[keep], std)
 
     def __len__(self) -> int:
         return len(self.phasor)
@@ -311,7 +308,7 @@ def estimate_motion(phases: WindowPhases, design: Floats, constants: Floats, *, 
 
     >>> design = np.random.default_rng(0).normal(size=(40, 3))
     >>> phase = 0.5 + design @ [0.3, -0.2, 0.1] + np.append(np.zeros(39), 2.0)
-    >>> motion = estimate_motion(WindowPhases(np.exp(1j * phase), *np.full((4, 40), 0.1)), design, design, radius_m=1.0)
+    >>> motion = estimate_motion(WindowPhases(np.exp(1j * phase), *np.full((3, 40), 0.1)), design, design, radius_m=1.0)
     >>> round(motion.constant_rad, 1), motion.residual_rad[-1].round(1), int(motion.stable.sum())
     (0.5, np.float64(2.0), 39)
     """
