@@ -221,7 +221,7 @@ class CoherenceDistribution:
         Examples
         --------
         >>> CoherenceDistribution(16.0).median(np.array([0.0, 0.9])).round(2), round(float(np.arctanh(0.9)), 2)
-        (array([0.21, 1.5 ]), 1.47)
+        (array([0.22, 1.51]), 1.47)
         """
         medians = [np.interp(np.log(0.5), row, _ESTIMATES) for row in _log_probabilities(self.looks)]
         return np.interp(np.arctanh(np.clip(coherence, 0, MOST_COHERENCE)), _COHERENCES, medians)
