@@ -21,7 +21,7 @@ from apertura.core.geometry.geodesy import local_crs
 from apertura.formats.export import exports_in
 from apertura.formats.export.cog import MAGNITUDE, POWER, SLC, write_cog, write_power, write_slc
 from apertura.formats.export.db import write_db
-from apertura.formats.export.interferogram import PHASE
+from apertura.formats.export.interferogram import write_phase
 from apertura.formats.export.layers import LAYOVER, LOOKS, MASK, OUTSIDE, SHADOW, write_line_of_sight, write_mask
 from apertura.formats.export.map_layout import DPI, LEFT, TOP, MapLayout
 from apertura.formats.export.quicklook import below_peak, shrink, write_quicklook
@@ -107,7 +107,11 @@ def test_every_raster_is_a_strictly_valid_cog(tmp_path, name, shape):
 
 
 @pytest.mark.quick("MODE-255")
-@pytest.mark.parametrize("band", [POWER, SLC, MASK, LOOKS, PHASE], ids=lambda band: f"{band.overviews}-{band.nodata}")
+@pytest.mark.parametrize(
+    "band",
+    [POWER, SLC, MASK, LOOKS, write_phase.keywords["band"]],
+    ids=lambda band: f"{band.overviews}-{band.nodata}",
+)
 def test_overviews_equal_those_of_gdal(tmp_path, band):
     """This also holds across block boundaries and next to undefined pixels."""
     rng, shape = np.random.default_rng(5), (READ + 256, 1040)
