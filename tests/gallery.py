@@ -448,8 +448,7 @@ def changes(results: Path) -> Figure:
 def stack(folder: Path) -> Made:
     flights = [f"f{number:02d}" for number in range(1, 6)]
     apertura("simulate", "campaign", "--preset", "revisit")
-    requested = {"reference": flights[0], "flights": flights[1:], "pair": "uav1-uav1"}
-    edit_config(folder / "campaign", lambda config: config.update(stack=requested, processing={"autofocus": "off"}))
+    edit_config(folder / "campaign", lambda config: config.update(processing={"autofocus": "off"}))
     apertura("run", "campaign", "--until", "stack")
     results, last = folder / "campaign/results/stack", flights[-1]
     with rasterio.open(results / last / "slc.tif") as image, rasterio.open(results / flights[0] / "slc.tif") as first:

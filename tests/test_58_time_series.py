@@ -166,8 +166,7 @@ def test_displacement_towards_the_sensor_is_positive_in_dolphin_and_mintpy(tmp_p
 def stacked(root, *, slope_mm):
     """Simulate five flights past a slope that moves towards the antennas, and form their stack."""
     simulate(root, revisit(slope_mm=slope_mm), seed=1)
-    requested = {"reference": "f01", "flights": ["f02", "f03", "f04", "f05"], "pair": "uav1-uav1"}
-    edit_config(root, lambda config: config.update(stack=requested, processing={"autofocus": "off"}))
+    edit_config(root, lambda config: config.update(processing={"autofocus": "off"}))
     assert run_workflow(root, 2, "--until", "stack") == 0
 
 

@@ -69,6 +69,7 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
             **_atmosphere_section(specification),
         },
         **({"bench": {**specification.bench}} if specification.bench else {}),
+        **({"stack": {**specification.stack}} if specification.stack else {}),
     }
     write_config(
         root,

@@ -397,6 +397,9 @@ def revisit(
         {"uav1": node},
         tuple(planned),
         ImageGrid(_UTM, half_width_m=11.0, spacing_m=0.125),
+        stack={"reference": "f01", "flights": tuple(flight.name for flight in planned[1:]), "pair": "uav1-uav1"}
+        if flights > 1
+        else {},
         synthesis="periodic",
     )
 

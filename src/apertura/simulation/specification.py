@@ -174,6 +174,9 @@ class CampaignSpecification:
     bench: Mapping[str, float | bool] = Field(
         default_factory=dict, description="section `bench` of the config, for flights of kind bench"
     )
+    stack: Mapping[str, str | tuple[str, ...] | int] = Field(
+        default_factory=dict, description="section `stack` of the config, for several flights over one scene"
+    )
     synthesis: Literal["exact", "periodic"] = Field(
         default="exact",
         description="exact, with the edges of each echo; or periodic, fast for long flights, with continuous echoes",
