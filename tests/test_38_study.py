@@ -437,10 +437,10 @@ def test_blocked_pulses_are_dropped_by_every_method():
     radar, sidelink, observation = receive_pair(scene, sweep.disturbance(0.4), np.random.default_rng(3))
     all_pulses = np.ones(60, bool)
     for method in CHOICES[1:]:
-        kept, transfer, _ = correct(method, radar, sidelink, all_pulses)
+        kept, transfer, _ = correct(method, radar, sidelink, all_pulses, np.random.default_rng(4))
         assert (kept == ~observation.draw.blocked).all()
         assert len(transfer) == kept.sum() < 60
-    assert correct("none", radar, sidelink, all_pulses)[0].all()
+    assert correct("none", radar, sidelink, all_pulses, np.random.default_rng(4))[0].all()
 
 
 def test_automatic_correction_is_within_0_2_db_of_the_best(monkeypatch):
@@ -453,6 +453,15 @@ def test_automatic_correction_is_within_0_2_db_of_the_best(monkeypatch):
     }
     best = np.min([loss[method] for method in CHOICES[1:-1]], axis=0)
     assert (np.array(loss["auto"]) - best).max() < 0.2
+
+
+def test_unknown_symbols_are_decided_above_the_least_snr_and_divided_below(monkeypatch):
+    monkeypatch.setitem(SWEEPS, "sidelink_noise", replace(SWEEPS["sidelink_noise"], sizes=(10, 5, -20), draws=1))
+    decided, divided, refused = STUDY.rows("sidelink_noise.unknown_qpsk")
+    assert (decided.chosen, divided.chosen) == ("two_parameter", "divide")
+    assert decided.loss_db < 0.05
+    assert decided.floor_db < divided.floor_db - 10
+    assert refused.pulses_used < 0.02
 
 
 def test_outcomes_read_back_and_give_a_tolerance(tmp_path):

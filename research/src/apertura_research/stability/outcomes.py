@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.core.backprojection.inputs import PhaseHistory
+from apertura.core.echo.constellation import CONSTELLATIONS
 from apertura.core.echo.line_of_sight import fit_line_of_sight
-from apertura.core.echo.sidelink import METHODS, choose, measure
+from apertura.core.echo.sidelink import LEAST_NOISE, METHODS, choose, measure
+from apertura.core.echo.unknown_symbols import SymbolDecider
 from apertura_research import point_response
 from apertura_research.paper_scene import receive_pair
 from apertura_research.point_response import find_peaks, mean_image
-from apertura_research.stability.sweeps import SWEEPS, ImpairmentSweep
+from apertura_research.stability.sweeps import SWEEPS, UNKNOWN, ImpairmentSweep
 
 REFUSED_DB = 40.0
 """Loss recorded if no pulse is imaged; larger losses are clipped to this value."""
@@ -125,7 +127,7 @@ def _draw(
     flown = sweep.flown(size)
     radar, sidelink, observation = receive_pair(flown, sweep.disturbance(size), generator)
     logged = sweep.logged(flown, size, generator)
-    kept, transfer, chosen = correct(method, radar, sidelink, observation.draw.kept)
+    kept, transfer, chosen = correct(method, radar, sidelink, observation.draw.kept, generator)
     if not kept.any():
         return _Measured(REFUSED_DB, 0.0, np.nan, np.nan, 0.0, 0.0), chosen
     history = point_response.phase_history(logged, transfer, divided=chosen != "none", pulses=kept)
@@ -133,7 +135,11 @@ def _draw(
 
 
 def correct(
-    method: str, radar: Complexes, sidelink: Complexes, recorded: NDArray[np.bool_]
+    method: str,
+    radar: Complexes,
+    sidelink: Complexes,
+    recorded: NDArray[np.bool_],
+    generator: np.random.Generator,
 ) -> tuple[NDArray[np.bool_], Complexes, str]:
     """Return the mask of used pulses, their corrected transfer functions, and the applied method.
 
@@ -147,20 +153,35 @@ def correct(
         (pulse, subcarrier) complex64.
     recorded
         (pulse,) bool.
+    generator
+        Source of the transmitted symbols, if they are unknown.
     """
     if method == "none":
         return recorded, radar[recorded], "none"
     kept = recorded.copy()
     chosen = method
-    if method == "auto":
-        try:
+    try:
+        if method == "auto":
             state = measure(sidelink[recorded])
-        except CampaignError:
-            return np.zeros_like(kept), radar[:0], "refused"
-        chosen, _ = choose(state)
-        kept[recorded] = state.locked
-    else:
-        kept[recorded] = fit_line_of_sight(sidelink[recorded]).locked
+            chosen, _ = choose(state)
+            kept[recorded] = state.locked
+        elif method == UNKNOWN:
+            # symbols of constant modulus turn the noise, which is circular
+            qpsk, pulses = CONSTELLATIONS["qpsk"], np.arange(int(recorded.sum()))
+            sent = qpsk.points[generator.integers(0, len(qpsk.points), sidelink[recorded].shape)]
+            received = sidelink[recorded] * sent
+            decisions = SymbolDecider.measured([(pulses, received)], qpsk).decide(received, pulses)
+            turned = sent / decisions.symbols
+            divides = np.median(decisions.snr) < qpsk.least_snr
+            chosen = "divide" if divides else choose(measure(received / decisions.symbols), LEAST_NOISE)[0]
+            kept[recorded] = decisions.path.locked if divides else decisions.sure
+            radar, sidelink = radar.copy(), sidelink.copy()
+            radar[recorded] *= turned
+            sidelink[recorded] *= turned
+        else:
+            kept[recorded] = fit_line_of_sight(sidelink[recorded]).locked
+    except CampaignError:
+        return np.zeros_like(kept), radar[:0], "refused"
     if not kept.any():
         return kept, radar[:0], "refused"
     return kept, METHODS[chosen](radar[kept], sidelink[kept]), chosen

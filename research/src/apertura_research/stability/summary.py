@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from apertura.common.tables import write_table
+from apertura.core.echo.sidelink import METHODS
 from apertura_research.stability.outcomes import StabilityRow, run_size, sizes_of
-from apertura_research.stability.sweeps import CHOICES, SWEEPS
+from apertura_research.stability.sweeps import CHOICES, SWEEPS, UNKNOWN
 from apertura_research.sweep import Study, crossing, draw_table, order_sizes, panels, with_unit
 
 LEVELS_DB = (1.0, 3.0)
@@ -19,6 +20,7 @@ EXPECTED = {
     "wiener": "floor 5 to 9 dB better than divide below 6 dB, biases the peak",
     "gated": "noise within ±16 cells remains",
     "two_parameter": "works down to −20 dB",
+    UNKNOWN: "decisions down to 7 dB, division below",
     "auto": "within 0.2 dB of the best",
 }
 """Method → prediction of an independent model."""
@@ -80,11 +82,8 @@ def write_sidelink_tables(outcomes: Sequence[StabilityRow], folder: Path) -> Non
 
     sidelink_methods.csv lists the SNR at which each method fails.
     """
-    methods = [method for method in CHOICES if method not in ("none", "auto")]
-    write_table(folder / "sidelink.csv", _snr_rows(outcomes, methods))
-    write_table(
-        folder / "sidelink_methods.csv", [_method_row(_of_method(outcomes, method)) for method in (*methods, "auto")]
-    )
+    write_table(folder / "sidelink.csv", _snr_rows(outcomes, list(METHODS)))
+    write_table(folder / "sidelink_methods.csv", [_method_row(_of_method(outcomes, method)) for method in CHOICES[1:]])
 
 
 def _snr_rows(outcomes: Sequence[StabilityRow], methods: Sequence[str]) -> list[dict[str, object]]:
@@ -118,6 +117,7 @@ _STYLES = {
     "wiener": ("#56b4e9", "^", "-"),
     "two_parameter": ("#d55e00", "D", "-"),
     "gated": ("#009e73", "v", "-"),
+    UNKNOWN: ("#e69f00", "x", "-"),
     "auto": ("#cc79a7", "", "-"),
 }
 

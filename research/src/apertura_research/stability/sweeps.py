@@ -23,8 +23,11 @@ from apertura.simulation.impairments import (
 from apertura.simulation.presets import paper_waveform
 from apertura_research.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, reduced_scene
 
-CHOICES = ("none", *METHODS, "auto")
-"""Corrections: none (the radar channel only), each method of the sidelink, and the automatic choice."""
+UNKNOWN = "unknown_qpsk"
+"""Correction by QPSK symbols that change from pulse to pulse and are decided from the sidelink."""
+
+CHOICES = ("none", *METHODS, UNKNOWN, "auto")
+"""Corrections: none (radar channel only), each method of the sidelink, unknown symbols, and the automatic choice."""
 
 PULSES = 240
 ORDINARY = Impairments(radar_snr_db=20.0, sidelink_snr_db=30.0)
