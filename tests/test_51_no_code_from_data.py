@@ -40,12 +40,16 @@ TYPED = {
     "compare": "compare plan.yaml .",
     "design": "design plan.yaml design",
     "diff": "diff results/f01/uav1-uav1/db.tif results/f01/uav1-uav2/db.tif",
+    "export stack": "export stack .",
+    "export time-series": "export time-series results",
     "init": "init new",
     "inspect": "inspect .",
     "list": "list",
     "preview": "preview .",
     "map": "map .",
+    "payload": "payload .",
     "plan": "plan .",
+    "publish": "publish . memory://bucket",
     "reflectors": "reflectors .",
     "report": "report .",
     "reproduce": "reproduce results/f01/uav1-uav1/db.tif",
@@ -57,6 +61,7 @@ TYPED = {
     "verify": "verify results/f01/fused/coherent_db.tif",
     "step assess": "step assess f01",
     "step calibrate": "step calibrate f01",
+    "step change": "step change f01",
     "step chart": "step chart f01 uav1-uav1 --seconds 1",
     "step cphd": "step cphd f01 uav1-uav2",
     "step echo": "step echo f01 uav1-uav2",
@@ -85,8 +90,8 @@ TYPED = {
 """Command → command line in the campaign folder, if it has arguments."""
 
 MAY_REFUSE = {
-    *("align", "bench", "step bench", "reflectors", "step calibrate", "step interferogram", "step page", "step stack"),
-    "step stack-image",
+    *("align", "bench", "export stack", "export time-series", "payload", "reflectors", "step bench", "step calibrate"),
+    *("step change", "step interferogram", "step page", "step stack", "step stack-image"),
 }
 """Commands whose requirements the tested campaign does not meet."""
 
