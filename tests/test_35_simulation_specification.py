@@ -47,6 +47,8 @@ def test_preset_has_echoes_inside_the_prefix_and_targets_on_the_grid(name):
         "paper-uav": (12.0, 4.0),
         "flight": 409.6,
         "first-flight": 12.0,
+        "payload": 12.0,
+        "revisit": 22.0,
     }
     width = widths.get(name, 6.0)
     assert (xmax - xmin, ymax - ymin) == pytest.approx(width if isinstance(width, tuple) else (width, width))

@@ -449,6 +449,8 @@ def text_keys():
 def with_text(config, path, text):
     """Return a config with a text at a key path; free names are those of the campaign, or x."""
     document = section = yaml.safe_load(yaml.safe_dump(config))
+    if path[:2] == ("waveform", "codes") and len(path) > 2:
+        document["waveform"]["codes"] = {"source": "sidelink", "constellation": "qpsk"}
     path = [
         "uav1" if (at, name) == (1, "*") and path[0] == "nodes" else "x" if name == "*" else name
         for at, name in enumerate(path)
