@@ -136,6 +136,7 @@ def test_echoes_of_changing_codes_equal_those_of_a_fixed_code(tmp_path, pair):
         assert difference_db(fixed.transfer.values, transfer_of(changing, pair).transfer.values) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.quick("True")
 @pytest.mark.parametrize("counter", [True, False])
 def test_missed_triggers_do_not_displace_the_codes(tmp_path, counter):

@@ -148,6 +148,7 @@ def test_pixels_of_unchanged_terrain_are_reported_at_the_rate(coherence, expecte
         assert within_binomial(count, pixels, rate / 2, clustered=(WINDOW / 2) ** 2)
 
 
+@pytest.mark.slow
 def test_decorrelated_terrain_without_change_of_amplitude_is_a_coherent_change():
     generator = np.random.default_rng(3)
     first, second = speckle(generator, 384)
@@ -178,6 +179,7 @@ def test_point_is_compared_by_its_amplitude_and_phase():
     assert kind(np.exp(1j), phase_std_rad=1.0) == UNCHANGED
 
 
+@pytest.mark.slow
 def test_steady_points_cause_no_false_alarms_in_the_windows_beside():
     generator, size = np.random.default_rng(10), 256
     first, second = speckle(generator, size)
@@ -216,6 +218,7 @@ def test_expected_number_of_false_regions_is_an_upper_limit():
     assert 0.1 * scenes * expected < found < scenes * expected + 3 * np.sqrt(scenes * expected)
 
 
+@pytest.mark.slow
 def test_windows_without_data_are_not_classified():
     first, second = speckle(np.random.default_rng(6), 96)
     second[:, 40] = np.nan
@@ -229,6 +232,7 @@ def test_windows_without_data_are_not_classified():
     assert not change_flags(empty)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("window", "coherence", "expected", "flags"),
     [

@@ -285,6 +285,7 @@ def test_tracks_with_too_short_a_baseline_give_no_height():
     assert np.isnan(interferogram.panels["height"]).all()
 
 
+@pytest.mark.slow
 def test_pixels_next_to_a_bright_point_have_no_height():
     first, second, ground = two_tracks(1.0, marked=True)
     interferogram = form_interferogram(first, second, ground, GRID.tiles(64), window=WINDOW)
@@ -298,6 +299,7 @@ def test_pixels_next_to_a_bright_point_have_no_height():
         assert np.nanmax(abs(error[neighbourhood] / std)) < 3.5  # residual effect of the flanks of the point
 
 
+@pytest.mark.slow
 def test_shadow_and_layover_of_either_image_are_undefined():
     first, second, ground = two_tracks(1.0)
     visible = np.ones((SIDE, SIDE), bool)

@@ -51,6 +51,7 @@ def test_products_are_published_without_recordings_and_intermediate_results(fini
     )
 
 
+@pytest.mark.slow
 def test_recordings_are_published_on_request(finished_tiny, memory):
     publish(finished_tiny, URL, raw=True, every=True)
     names = objects(memory)
@@ -85,6 +86,7 @@ def test_dry_run_writes_nothing(finished_tiny, memory):
     assert next(changes.lines).startswith(f"{len(changes.uploads)} files to upload")
 
 
+@pytest.mark.slow
 def test_files_that_no_longer_exist_are_deleted_after_the_catalog_was_replaced(finished_tiny, memory, monkeypatch):
     publish(finished_tiny, URL)
     record = json.loads(memory.cat(f"/bucket/area/{RECORD}"))
@@ -113,6 +115,7 @@ def targets(document, name):
     return [os.path.normpath(f"{name.rpartition('/')[0]}/{href}") for href in hrefs if "://" not in href]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.97, 0.99])
 def test_interrupted_upload_leaves_no_catalog_that_names_missing_objects(finished_tiny, memory, monkeypatch, share):
     """After any failing upload, published documents refer to published objects only, and the next run completes."""
@@ -167,6 +170,7 @@ def test_result_that_is_out_of_date_is_not_published(writable, memory):
     assert objects(memory) == set()
 
 
+@pytest.mark.slow
 def test_damaged_chunk_is_not_published(writable, memory):
     """A chunk is compared with the manifest when it is uploaded."""
     chunk = next(path for path in (writable.stage("cube") / "image/c").rglob("*") if path.is_file())
@@ -220,6 +224,7 @@ def test_record_cannot_name_objects_outside_the_prefix(finished_tiny, memory):
     assert memory.exists("/bucket/other")
 
 
+@pytest.mark.slow
 def test_folder_is_a_target(finished_tiny, tmp_path):
     publish(finished_tiny, f"file://{tmp_path}/published")
     copy = tmp_path / "published/results"
