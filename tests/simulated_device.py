@@ -30,7 +30,7 @@ import apertura as ap
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import cuda, native, reference
-from apertura.core.backprojection.engines.cuda_prediction import candidates
+from apertura.core.backprojection.engines.cuda_prediction import candidates, simulated
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.backprojection.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
@@ -114,7 +114,7 @@ def test_slices_and_copies_of_tables_sum_their_pulses(plain, tables):
     assert {part.resident for part in parts} == {tables.resident}
     assert decibels(sum(cuda.form(part, places) for part in parts) - whole, whole) <= -110
     copy = pickle.loads(pickle.dumps(tables[0:10]))
-    assert copy.resident.arrays is None
+    assert copy.resident.tables is None
     np.testing.assert_array_equal(cuda.form(copy, places), cuda.form(parts[0], places))
 
 
@@ -346,8 +346,8 @@ def test_more_chunks_than_threads_are_checked_in_groups(long):
     scene, places, tables = long
     cuda.form(tables, places)
     repeated, pulses = cuda.Resident(), 33 * 128
-    repeated.arrays = tuple(
-        numba_cuda.to_device(np.concatenate([array.copy_to_host()[:128]] * 33)) for array in tables.resident.arrays
+    repeated.tables = tuple(
+        numba_cuda.to_device(np.concatenate([array.copy_to_host()[:128]] * 33)) for array in tables.resident.tables
     )
     many, turn = replace(tables, pulses=slice(0, pulses), resident=repeated), np.full(pulses, 100.0)
     turn[-20:-10] = 0.0
@@ -433,7 +433,8 @@ def test_device_error_is_one_message(plain, monkeypatch):
     from numba.cuda.cudadrv.driver import CudaAPIError
 
     def full(*_args, **_more):
-        raise CudaAPIError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY")
+        message = "Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY"
+        raise CudaAPIError(f"[2] {message}") if simulated() else CudaAPIError(2, message)
 
     _, pixels, profiles = plain
     monkeypatch.setattr(numba_cuda, "device_array", full)

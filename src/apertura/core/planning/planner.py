@@ -143,8 +143,8 @@ class SettingSearch:
     def _engines(self) -> list[str]:
         """Return the available engines that match the request.
 
-        Engines without a measured cost are included only if requested. A substitute engine needs ten seconds for
-        compilation at run time and is therefore excluded if the engine that it replaces was built.
+        A substitute engine needs ten seconds for compilation at run time and is therefore excluded if the engine that
+        it replaces was built.
         """
         reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
         runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]
@@ -168,8 +168,7 @@ class SettingSearch:
         with_options = [name for name in runnable if self._requested(name)]
         if with_options:
             return with_options
-        timed = [name for name in runnable if getattr(load_engine(name), "TIMED", True)]
-        return [name for name in timed if getattr(load_engine(name), "STANDS_IN_FOR", None) not in timed]
+        return [name for name in runnable if getattr(load_engine(name), "STANDS_IN_FOR", None) not in runnable]
 
 
 # ---- The planner

@@ -11,7 +11,8 @@ import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from threading import Lock
 from typing import Annotated, Any, Literal
@@ -33,7 +34,8 @@ from apertura.core.backprojection.inputs import Profiles
 # ---- Device and arrays on the device
 #
 # numba.cuda is imported when a device is used. The device executes one call at a time: threads that form tiles wait
-# for the lock of the device without the GIL.
+# for the lock of the device without the GIL. With a stream for each of 16 threads, tiles of 256 pixels took twice as
+# long on an H200, because the threads wait for the GIL after every call of the driver.
 
 _LOCK = Lock()
 # threads per block of the kernel that fills tables, and of the kernel that compares pulses
@@ -41,6 +43,28 @@ _THREADS, _CHUNK_THREADS = 128, 32
 
 
 @cache
+def missing() -> str | None:
+    """Return the reason why no device can be used; None if there is one, or if the simulator of numba is enabled.
+
+    Examples
+    --------
+    >>> missing() is None or isinstance(missing(), str)
+    True
+    """
+    try:
+        if not simulated():
+            ctypes.CDLL("libcuda.so.1")  # fails without the library of the driver, before the slow imports below
+        from numba import cuda
+
+        if not cuda.is_available():
+            return "no device"
+        if not simulated():
+            import_module("numba.cuda.np.arrayobj")  # fails with a NumPy that numba-cuda does not support
+    except Exception as error:  # driver, toolkit or package is missing or incompatible
+        return "no device" if isinstance(error, OSError) else " ".join(f"{type(error).__name__}: {error}".split())
+    return None
+
+
 def available() -> bool:
     """Return True if a device can be used or the simulator of numba is enabled; never raises.
 
@@ -49,26 +73,19 @@ def available() -> bool:
     >>> available() in (True, False)
     True
     """
-    try:
-        if not simulated():
-            ctypes.CDLL("libcuda.so.1")  # fails without the library of the driver, before the slow import below
-        from numba import cuda
-
-        return bool(cuda.is_available())
-    except Exception:  # driver, toolkit or package is missing or incompatible
-        return False
+    return missing() is None
 
 
 def instruction_set() -> str:
-    """Return the device on this machine and the package with which it is used.
+    """Return the device on this machine and the package with which it is used, or the reason why none can be used.
 
     Examples
     --------
     >>> instruction_set().split()[0]
     'cuda:'
     """
-    if not available():
-        return "cuda: no device"
+    if reason := missing():
+        return f"cuda: {reason}"
     from numba import cuda
 
     try:
@@ -83,13 +100,36 @@ def instruction_set() -> str:
 
 
 class Resident:
-    """Arrays on the device, created with the first tile and shared by all slices of the tables; not pickled."""
+    """Arrays on the device, shared by all slices of the tables and all tiles; not pickled.
+
+    Attributes
+    ----------
+    tables
+        Phase centres, starts and cells of all pulses; None before the first tile.
+    """
 
     def __init__(self) -> None:
-        self.arrays: tuple[Any, ...] | None = None
+        self.tables: tuple[Any, ...] | None = None
+        self._memory: dict[str, Any] = {}
 
     def __reduce__(self) -> tuple[type["Resident"], tuple[()]]:
         return Resident, ()
+
+    def array(self, cuda: Any, name: str, shape: tuple[int, ...], dtype: Any) -> Any:
+        """Return an array of undefined content; arrays of the same name share their memory from tile to tile."""
+        size = int(np.prod(shape))
+        if size == 0:
+            return cuda.device_array(shape, dtype)
+        if name not in self._memory or self._memory[name].size < size:
+            self._memory[name] = cuda.device_array(size, dtype)
+        return self._memory[name][:size].reshape(shape)
+
+    def copied(self, cuda: Any, name: str, values: NDArray[Any]) -> Any:
+        """Return a copy on the device."""
+        array = self.array(cuda, name, values.shape, values.dtype)
+        if values.size:
+            array.copy_to_device(np.ascontiguousarray(values))
+        return array
 
 
 def sum_on_device(
@@ -116,46 +156,45 @@ def sum_on_device(
     CampaignError
         If no device can be used, or if the device fails.
     """
-    sector = beams and beams.sector
-    weights = _weights(beams or Beams())
+    resident, (rows, columns) = tables.resident, pixels.shape[:2]
     with _device() as cuda:
         from apertura.core.backprojection.engines import cuda_kernels as kernels
 
-        if tables.resident.arrays is None:
-            tables.resident.arrays = _tables_on_device(cuda, tables)
-        phase_centres, start_m, cells = (array[tables.pulses] for array in tables.resident.arrays)
-        # Parameters of the kernel: scales, phase polynomial, sector.
-        scales = (1 / tables.cell_m, tables.wavenumber_rad_m, tolerance_rad, cells.shape[2])
-        bounds = (sector.centre, sector.inner, sector.outer) if sector else (0.0, 0.0, 0.0)
-        phase = tables.design.phase_coefficients.copy()
-        if not PHASE_POLYNOMIALS[tables.design.phase_polynomial][2]:
-            phase[-1] = 0  # no reduction by multiples of π
-        numbers = np.array([*scales, *phase, *bounds], np.float64)
-        # Weights, and spread of axes and antenna positions within each chunk of 64 pulses, which is used to reject
-        # chunks.
-        on_device = [cuda.to_device(array) for array in weights]
-        spread = cuda.to_device(np.full((-(-len(start_m) // CHUNK) + 1, 2, 3), np.inf))
+        if resident.tables is None:
+            resident.tables = _tables_on_device(cuda, tables)
+        phase_centres, start_m, cells = (array[tables.pulses] for array in resident.tables)
+        # Inputs of the tile: pixels; weights; spread of axes and antenna positions within each chunk of 64 pulses,
+        # which is used to reject chunks.
+        copied = partial(resident.copied, cuda)
+        places = copied("pixels", pixels)
+        numbers = copied("numbers", _numbers(tables, beams, tolerance_rad, cells.shape[1] // 3 - 1))
+        weights = [copied(f"weights {n}", array) for n, array in enumerate(_weights(beams or Beams()))]
+        spread = copied("spread", np.full((-(-len(start_m) // CHUNK) + 1, 2, 3), np.inf))
         if beams and rejecting:
             blocks = -(-len(spread) // _CHUNK_THREADS)
-            kernels.spread_of_chunks[blocks, _CHUNK_THREADS](phase_centres, *on_device[:2], spread)
+            kernels.spread_of_chunks[blocks, _CHUNK_THREADS](phase_centres, *weights[:2], spread)
         # One thread block per patch.
-        rows, columns = pixels.shape[:2]
-        image, tally = (
-            cuda.device_array((rows, columns), np.complex64),
-            cuda.to_device(np.zeros(len(VARIANTS), np.int64)),
-        )
+        image = resident.array(cuda, "image", (rows, columns), np.complex64)
+        tally = copied("tally", np.zeros(len(VARIANTS), np.int64))
         patches = (-(-columns // SIDE), -(-rows // SIDE))
         form = kernels.form_weighed if beams else kernels.form
         form[patches, (SIDE, kernels.ROWS)](
-            cuda.to_device(pixels),
-            (phase_centres, start_m, cells),
-            cuda.to_device(numbers),
-            (*on_device, spread),
-            (image, tally),
+            places, (phase_centres, start_m, cells), numbers, (*weights, spread), (image, tally)
         )
         if counts is not None:
             counts += tally.copy_to_host()
         return np.asarray(image.copy_to_host())
+
+
+def _numbers(tables: "ResidentTables", beams: Beams | None, tolerance_rad: float, cells: int) -> NDArray[np.float64]:
+    """Return the parameters of the kernel: scales, phase polynomial, sector."""
+    sector = beams and beams.sector
+    scales = (1 / tables.cell_m, tables.wavenumber_rad_m, tolerance_rad, cells)
+    bounds = (sector.centre, sector.inner, sector.outer) if sector else (0.0, 0.0, 0.0)
+    phase = tables.design.phase_coefficients.copy()
+    if not PHASE_POLYNOMIALS[tables.design.phase_polynomial][2]:
+        phase[-1] = 0  # no reduction by multiples of π
+    return np.array([*scales, *phase, *bounds], np.float64)
 
 
 def _weights(beams: Beams) -> tuple[NDArray[Any], ...]:
@@ -194,19 +233,20 @@ def _tables_on_device(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
     used = (length - 1) * design.up // design.down + 1
     carrier = np.exp(1j * np.remainder(k * tables.cell_m * np.arange(used), 2 * np.pi)).astype(np.complex64)
     carrier_at_start = np.exp(1j * np.remainder(k * tables.start_m, 2 * np.pi)).astype(np.complex64)
-    cells = cuda.device_array((pulses, 6, used), np.float32)
+    cells = cuda.device_array((pulses, 3 * (used + 1)), np.uint64)  # the last cell of a pulse is 0
     samples, taps, lead, carrier, carrier_at_start = map(
         cuda.to_device, (tables.samples, design.taps, design.lead, carrier, carrier_at_start)
     )
-    expand[-(-pulses * used // _THREADS), _THREADS](samples, taps, lead, design.down, carrier, carrier_at_start, cells)
+    blocks = -(-pulses * (used + 1) // _THREADS)
+    expand[blocks, _THREADS](samples, taps, lead, design.down, carrier, carrier_at_start, cells)
     return cuda.to_device(tables.places_m), cuda.to_device(tables.start_m), cells
 
 
 @contextmanager
 def _device() -> Iterator[Any]:
     """Yield numba.cuda under the lock of the device; report failures of the device as CampaignError."""
-    if not available():
-        raise _unusable("no device can be used")
+    if reason := missing():
+        raise _unusable(f"no device can be used ({reason})")
     from numba import cuda
     from numba.cuda.cudadrv.driver import CudaAPIError, LinkerError
 
@@ -228,10 +268,9 @@ def _unusable(found: str) -> CampaignError:
 
 # ---- Engine
 
-__all__ = ["NEEDS", "READS", "TIMED", "VARIANTS", "available", "candidates", "form", "instruction_set", "prepare"]
+__all__ = ["NEEDS", "READS", "VARIANTS", "available", "candidates", "form", "instruction_set", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
-TIMED = False  # the cost is based on published rates of other software, whereas the planner compares measured costs
 VARIANTS = ("by series", "by exact paths", "without an echo", "without an echo of 64")
 NEEDS = "an NVIDIA GPU with driver, and apertura[cuda] (docs/howto/gpu.md)"
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,33 @@ def simulated() -> bool:
     return os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
 
 
+@cache
+def device_rates() -> tuple[float, float]:
+    """Return the float32 and float64 rates of the device relative to an H200, from its number of units and its clock.
+
+    Examples
+    --------
+    >>> device_rates() > (0, 0)
+    True
+    """
+    if simulated():
+        return 1.0, 1.0
+    from numba import cuda
+
+    if not cuda.is_available():
+        return 1.0, 1.0
+    device = cuda.get_current_device()
+    major, minor = device.compute_capability
+    units = 64 if (major, minor) in _HALF_UNITS else 128  # float32 units of a multiprocessor
+    single = device.MULTIPROCESSOR_COUNT * units * device.CLOCK_RATE / _H200
+    return single, single * (1 if (major, minor) in _FAST_DOUBLES else 1 / 32)
+
+
+_HALF_UNITS = {(6, 0), (7, 0), (7, 2), (7, 5), (8, 0)}
+_FAST_DOUBLES = {(6, 0), (7, 0), (8, 0), (9, 0), (10, 0)}  # half the rate of float32; other devices: 1/64
+_H200 = 132 * 128 * 1.98e6  # multiprocessors, float32 units, clock in kHz
+
+
 # ratio of RMS to maximum of a sixth power along the diagonal of a square patch, √(2/13 − 2/14)
 _WORST_TO_RMS = 0.105
 
@@ -78,22 +106,24 @@ _FLOAT32_RAD = 2e-6  # rounding error of tables and look-ups, as in native
 _NO_ERROR = 1e-20  # added before taking a logarithm
 
 
-# Seconds, which are not measured: a tenth of the rate published by torchbp for a card of 2022 (docs/theory/engine.md,
-# "A GPU"), float64 at 1/64 of the rate of float32 as on consumer cards, transfers at 10 GB/s, and start of the first
-# kernel.
-_PIXEL_S, _EXACT_S = 5e-11, 5e-9  # per pixel and pulse: by the series, by exact paths
+# Seconds measured on an NVIDIA H200 (docs/theory/engine.md, "A GPU"). On other devices, the first four are divided by
+# `device_rates`.
+_PIXEL_S, _EXACT_S = 2.6e-12, 7.9e-12  # per pixel and pulse: by the series, by exact paths
 
 
-_CELL_S, _SAMPLE_S = 2e-11, 8e-10  # per pulse and coefficient of a cell; per pulse and sample
+_SECTOR_S, _BEAM_S = 6e-12, 1e-11  # additional time at the edge of a sector and for each beam
 
 
-_PLACE_S = 3.2e-9  # per pixel: transfer of position and sum
+_CELL_S, _SAMPLE_S = 2e-11, 1.2e-9  # per pulse and coefficient of a cell; per pulse and sample
 
 
-_SECTOR_S, _BEAM_S = 3e-11, 1e-10  # additional time at the edge of a sector and for each beam, from operation counts
+_PLACE_S = 6e-9  # per pixel: transfer of position and sum
 
 
-_START_S = 3.0
+_TILE_S = 1e-2  # per tile: copies, launch, and multiprocessors without work at the end of the kernel
+
+
+_START_S = 2.0  # import of numba.cuda and first kernel, if the kernels were compiled in an earlier run; else 7
 
 
 _SIMULATED_S = 1e-4  # per pixel and pulse in the simulator, and half of that per weight (measured)
@@ -180,8 +210,9 @@ def _pixel_seconds(view: View, exact: float) -> float:
     weights = view.weights
     if simulated():
         return (1 - weights.dark) * (1 + (weights.antennas + weights.edge) / 2) * _SIMULATED_S
-    series_s = _PIXEL_S + weights.antennas * _BEAM_S + weights.edge * _SECTOR_S
-    exact_s = _EXACT_S * (1 + weights.antennas + weights.edge)
+    single, double = device_rates()
+    series_s = (_PIXEL_S + weights.antennas * _BEAM_S + weights.edge * _SECTOR_S) / single
+    exact_s = _EXACT_S * (1 + weights.antennas + weights.edge) / double
     return (1 - weights.dark) * ((1 - exact) * series_s + exact * exact_s)
 
 
@@ -195,17 +226,18 @@ def _setting(job: Job, view: View, weights: float, pulses: int, oversampling: in
     weighted = f", weights {weights_db:.1f} dB" if job.weights else ""
     up, down = ratio(signal.oversampling, oversampling)
     coefficients = pulses * ((signal.samples - 1) * up // down + 1) * (DEGREE + 1)
+    # Threads share the device: the time of the device does not depend on their number.
+    device_s = job.pixels * pulses * job.share * _pixel_seconds(view, exact) + job.tiles * _TILE_S
     return Setting(
         "cuda",
         {"oversampling": oversampling},
         {"tolerance_rad": tolerance_rad},
         power_sum_db(table_db, paths_db, weights_db),
-        job.pixels * (pulses * job.share * _pixel_seconds(view, exact) + _PLACE_S),
+        device_s * min(job.threads, job.tiles) + job.pixels * _PLACE_S,
         table_seconds=_START_S + _CELL_S * coefficients + _SAMPLE_S * pulses * signal.samples,
         table_bytes=8 * coefficients,
         reasons={
-            "oversampling": f"predicted errors: table {table_db:.1f} dB, paths {paths_db:.1f} dB{weighted}; "
-            "the predicted time is not based on measurements",
+            "oversampling": f"predicted errors: table {table_db:.1f} dB, paths {paths_db:.1f} dB{weighted}",
             "tolerance_rad": f"exact float64 paths for {100 * exact:.0f} % of pixel-pulse pairs",
         },
     )

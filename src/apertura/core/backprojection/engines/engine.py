@@ -36,7 +36,7 @@ class Setting:
     form_seconds, table_seconds
         Predicted time for all pixels, and for the tables common to all tiles, on one core of a server of 2023 with
         AVX-512. On other machines, the ratios between the times of settings are approximately the same; the choice
-        therefore depends only on the job.
+        therefore depends only on the job. The time of a GPU is multiplied by the number of threads, which share it.
     table_bytes
         Size of the tables of all pulses.
     reasons
@@ -90,9 +90,6 @@ class Engine(Protocol):
         Returns True if the engine can run on this machine.
     NEEDS
         Requirements, one phrase; not defined by an engine without requirements.
-    TIMED
-        False if the cost of the engine has not been measured: the engine is used only on request and is never selected
-        by the planner.
     candidates
         (job, pulses=, requested=) → settings with predicted error and cost. `pulses` may be smaller than the number of
         pulses of the job; `requested` contains options fixed by the config.
