@@ -183,7 +183,7 @@ def test_summary_lists_heights_and_flags_of_an_interferogram(small, tmp_path, ca
     print_summary(Campaign.load(root))
     message = capsys.readouterr().out
     assert "height_relative" in message
-    assert "interferometry two_tracks: no point of known height is visible" in message
+    assert "interferogram two_tracks: no point of known height is visible" in message
 
 
 def with_positions(small, folder, monkeypatch, positions):

@@ -358,6 +358,7 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
         "chance": round(chance(referred.looks), 4) if referred.looks > 1 else 1.0,
         "flags": fit.flags,
     }
+    report["says"] = f"left out: {fit.reason}" if fit.reason else _summary(report)
     origin = Provenance.of(
         lineage.modules,
         {name: one.stage for name, one in ((requested.reference, reference), (flight, image))},
@@ -388,6 +389,14 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
     write_json(written[-1], report)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
+
+
+def _summary(report: dict[str, Any]) -> str:
+    """Return the summary of a flight that is used, one line."""
+    return (
+        f"perpendicular baseline {report['perpendicular_baseline_m']:.2f} m, coherence {report['coherence']:.2f} "
+        f"({report['expected_coherence']:.2f} expected), residual phase {report['residual_phase_std_rad']:.2f} rad"
+    )
 
 
 def requested_stack(campaign: Campaign) -> Stack:

@@ -80,9 +80,9 @@ def print_summary(campaign: Campaign) -> None:
             f"not in the error budget, because their uncertainty is not configured: {', '.join(not_stated)}; see "
             "image.json"
         )
-    between = {**dict(_interferograms(campaign)), **dict(_stacked(campaign)), **dict(_changes(campaign))}
+    between = dict(_between_flights(campaign))
     for name, report in between.items():
-        console.print(f"{name.replace(INTERFEROMETRY, 'interferogram', 1)}: {report['says']}", soft_wrap=True)
+        console.print(f"{name}: {report['says']}", soft_wrap=True)
     _print_flags(console, {**reports, **between})
     if missing := [" ".join(image) for image in names if image not in current]:
         console.print(f"missing or out of date: {_abbreviated(missing)}; `apertura run` computes them", soft_wrap=True)
@@ -137,46 +137,20 @@ def print_products(campaign: Campaign) -> None:
         print(f"  map of all images: apertura map {shlex.quote(str(campaign.root))}")
 
 
-def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield name and summary of each up-to-date interferogram."""
-    for name in campaign.settings.interferometry.pairs:
-        path = campaign.result(INTERFEROMETRY, name, "interferogram.json")
-        if campaign.is_current(campaign.result(INTERFEROMETRY, name, "interferogram")):
-            report = open_listed(path, path.with_name("interferogram.manifest.json"))
-            with undamaged(path, expected="the report of an interferogram", remedy="Run the workflow again."):
+def _between_flights(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield name and summary of each up-to-date interferogram, flight of the stack, and change between flights."""
+    pairs, stack = campaign.settings.interferometry.pairs, campaign.settings.stack
+    flights = stack.flights if stack else ()
+    products = [("interferogram", INTERFEROMETRY, name, "interferogram", "interferogram") for name in pairs]
+    products += [("stack", STACK, flight, "stack", "stack_image") for flight in flights]
+    products += [("changes", STACK, flight, "change", "change") for flight in flights]
+    for heading, folder, name, document, result in products:
+        path = campaign.result(folder, name, f"{document}.json")
+        if campaign.is_current(campaign.result(folder, name, result)):
+            report = open_listed(path, path.with_name(f"{result}.manifest.json"))
+            with undamaged(path, expected=f"the report of step {result}", remedy="Run the workflow again."):
                 entry = {"says": shown(report["says"], 400), "flags": printable(report["flags"])}
-            yield f"{INTERFEROMETRY} {name}", entry
-
-
-def _stacked(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield name and summary of each up-to-date flight of the stack, except the reference."""
-    stack = campaign.settings.stack
-    for flight in stack.flights if stack else ():
-        path = campaign.result(STACK, flight, "stack.json")
-        if campaign.is_current(campaign.result(STACK, flight, "stack_image")):
-            report = open_listed(path, path.with_name("stack_image.manifest.json"))
-            with undamaged(path, expected="the report of a flight of the stack", remedy="Run the workflow again."):
-                says = f"left out: {report['reason']}"
-                if report["used"]:
-                    says = (
-                        f"perpendicular baseline {report['perpendicular_baseline_m']:.2f} m, coherence "
-                        f"{report['coherence']:.2f} ({report['expected_coherence']:.2f} expected), residual phase "
-                        f"{report['residual_phase_std_rad']:.2f} rad"
-                    )
-                entry = {"says": shown(says, 400), "flags": printable(report["flags"])}
-            yield f"{STACK} {flight}", entry
-
-
-def _changes(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield name and summary of the changes of each flight of the stack for which they are up to date."""
-    stack = campaign.settings.stack
-    for flight in stack.flights if stack else ():
-        path = campaign.result(STACK, flight, "change.json")
-        if campaign.is_current(campaign.result(STACK, flight, "change")):
-            report = open_listed(path, path.with_name("change.manifest.json"))
-            with undamaged(path, expected="the changes of a flight", remedy="Run the workflow again."):
-                entry = {"says": shown(report["says"], 400), "flags": printable(report["flags"])}
-            yield f"changes {flight}", entry
+            yield f"{heading} {name}", entry
 
 
 def _abbreviated(names: Sequence[str], most: int = 3) -> str:

@@ -14,6 +14,7 @@ from pystac.layout import CustomLayoutStrategy
 
 from apertura.common.attribution import Attribution
 from apertura.common.errors import CampaignError
+from apertura.common.leap_seconds import GPS_EPOCH
 from apertura.common.raster import opened_raster
 from apertura.common.units import frequency_band
 from apertura.core.geometry.geodesy import longitude_range
@@ -39,7 +40,7 @@ EXTENSIONS: Mapping[str, str] = {
 POLARISATIONS = frozenset({"HH", "HV", "VH", "VV", "LH", "LV", "RH", "RV"})
 """Polarisations of the SAR extension that a configured pair of antennas can have."""
 
-_FIRST_CLOCK = datetime(1980, 1, 6, tzinfo=UTC)  # epoch of GPS time; earlier times are pulse counters
+_FIRST_CLOCK = GPS_EPOCH.astype("datetime64[us]").item().replace(tzinfo=UTC)  # earlier times are pulse counters
 _NO_CLOCK = "none: the recording contains no time of day; times are pulse numbers in seconds since 1970-01-01"
 
 

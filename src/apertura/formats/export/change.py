@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from rasterio import Affine
 from rasterio.features import shapes
 
-from apertura.formats.export.cog import Band, NorthUpRaster, only, write_cog
+from apertura.formats.export.cog import Band, only, write_cog
 from apertura.formats.export.geopackage import Ring, write_geopackage
 
 NO_DATA = 255
@@ -71,37 +72,10 @@ class ChangedRegions:
     date: str
 
 
-def write_amplitude_ratio(
-    path: Path, ratio_db: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-) -> None:
-    """Write the power ratio, (y, x) float32 dB, NaN without data; parameters as in `cog.write_slc`."""
-    write_cog(path, ratio_db, RATIO, transform=transform, crs=crs, tags=tags, title=title)
-
-
-def write_coherence_loss(
-    path: Path, loss: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-) -> None:
-    """Write the loss of coherence, (y, x) float32, NaN without data. Otherwise as `write_amplitude_ratio`."""
-    write_cog(path, loss, LOSS, transform=transform, crs=crs, tags=tags, title=title)
-
-
-def write_change(
-    path: Path, classes: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
-) -> None:
-    """Write the classes of change, (y, x) uint8. Otherwise as `write_amplitude_ratio`.
-
-    Examples
-    --------
-    >>> import rasterio
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder) / "change.tif"
-    ...     write_change(path, np.ones((2, 3), "u1"), transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags={})
-    ...     with rasterio.open(path) as raster:
-    ...         raster.units[0], raster.read(1)[0, 0].item()
-    ('class', 1)
-    """
-    write_cog(path, classes, CLASS, transform=transform, crs=crs, tags=tags, title=title, value=only("uint8"))
+# Writers of one raster each, (y, x); parameters of `apertura.formats.export.cog.write_slc`.
+write_amplitude_ratio = partial(write_cog, band=RATIO)
+write_coherence_loss = partial(write_cog, band=LOSS)
+write_change = partial(write_cog, band=CLASS, value=only("uint8"))
 
 
 def write_regions(
@@ -110,7 +84,7 @@ def write_regions(
     """Write the regions as multipolygons of a GeoPackage, with the attributes `COLUMNS`.
 
     Pixels that touch only at a corner belong to different polygons of the same feature. Otherwise as
-    `write_amplitude_ratio`; `tags` are not written.
+    `apertura.formats.export.cog.write_slc`; `tags` are not written.
     """
     del tags
     polygons: dict[int, list[list[Ring]]] = {}
