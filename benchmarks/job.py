@@ -95,17 +95,21 @@ def echoes(tx: NDArray, rx: NDArray, scatterers: NDArray, amplitude: NDArray, at
     return samples.astype(np.complex64)
 
 
-def build(size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface: Surface = "flat") -> Job:
-    """Return the job; profiles are exact samples of the band-limited echo."""
+def build(
+    size: int = 512, pulses: int = 1024, *, bistatic: bool = True, surface: Surface = "flat", count: int = 100
+) -> Job:
+    """Return the job with `count` scatterers; profiles are exact samples of the band-limited echo."""
     generator = np.random.default_rng(1)
     tx, rx = flight(generator, pulses, bistatic=bistatic)
     pixels = grid(size, surface=surface)
     flat = pixels.reshape(-1, 3)
-    scatterers = flat[generator.integers(0, len(flat), 100)] + generator.uniform(-0.025, 0.025, (100, 3)) * [1, 1, 0]
-    amplitude = generator.standard_normal(100) + 1j * generator.standard_normal(100)
+    places = flat[generator.integers(0, len(flat), count)]
+    scatterers = places + generator.uniform(-0.025, 0.025, (count, 3)) * [1, 1, 0]
+    amplitude = generator.standard_normal(count) + 1j * generator.standard_normal(count)
     step = C / (SUBCARRIERS * SPACING_HZ) / 2
     edge = grid(64, 0.05 * size * 1.45 / 64)  # also covers rotated grids
-    paths = total_path(tx, rx, np.concatenate([edge, pixels[::8, ::8]], axis=None).reshape(-1, 3))
+    coarse = max(8, size // 64)
+    paths = total_path(tx, rx, np.concatenate([edge, pixels[::coarse, ::coarse]], axis=None).reshape(-1, 3))
     start = paths.min(1) - GUARD * step
     length = int(np.ceil((paths.max(1) - start).max() / step)) + GUARD
     at = start[:, None] + step * np.arange(length)
