@@ -20,6 +20,7 @@ from apertura.stages import echo, ingest
 from apertura.stages.scene import open_scene
 from apertura.stages.transfer import PairEcho
 from apertura.tools.payload import payload, payloads, print_payload
+from apertura.tools.preview.follow import Preview
 from apertura.views.report.pictures import pictures, pictures_fused
 from apertura.views.report.step import page
 from apertura.workflow.stale import outdated_places
@@ -187,6 +188,46 @@ def test_pulses_with_a_weak_sidelink_are_excluded(tmp_path):
     assert stage.attrs["pulses"]["reasons"]["symbols_unsure"] == 14
     assert stage.attrs["flags"]["symbols_unsure"].startswith("symbols of 14 of 96 pulses are unsure")
     assert not np.isin(np.arange(10, 24), stage.capture.values).any()
+
+
+def advanced(preview, *, ended=False):
+    """Read the files of a preview, and add all pulses that are ready; return the pairs."""
+    preview._read()
+    for pair in preview.pairs:
+        while pair.add_next(ended=ended) or pair.refine_next():
+            pass
+    return preview.pairs
+
+
+@pytest.mark.slow
+def test_preview_follows_the_sidelink_that_gives_the_symbols(tmp_path):
+    """Monostatic pulses are added as the receiver records them, and then show five targets within a centimetre."""
+    root = tmp_path / "campaign"
+    truth = own_campaign.write(root)
+    data = root / "raw" / "f01" / "uav2.sigmf-data"
+    whole = data.read_bytes()
+    data.write_bytes(b"")
+    preview = Preview(Campaign.load(root), follow=True)
+    pair = advanced(preview)[0]
+    assert (pair.name, pair.counts["added"]) == ("uav1-uav1", 0)
+    assert pair.waits == "symbols are decided from the sidelink of uav2, which has recorded 0 captures"
+    for share in (0.4, 0.7):
+        data.write_bytes(whole[: int(share * len(whole))])
+        assert 200 * share - 3 <= advanced(preview)[0].counts["added"] < 200 * share
+    data.write_bytes(whole)
+    pair = advanced(preview, ended=True)[0]
+    assert (pair.counts["added"], pair.waits, pair.flags) == (200, "", {})
+    assert_focused(pair.images[1].image, pair.images[1].grid, truth)
+
+
+@pytest.mark.slow
+def test_preview_of_ambiguous_symbols_is_bistatic(tmp_path):
+    """Without pilots and header, the monostatic pair states the reason."""
+    own_campaign.write(tmp_path / "campaign", pulses=64)
+    edit_config(tmp_path / "campaign", lambda config: config["waveform"]["codes"].pop("frame"))
+    alone, other = advanced(Preview(Campaign.load(tmp_path / "campaign"), follow=False), ended=True)
+    assert "ambiguous by quarter turns" in alone.waits
+    assert (alone.counts["added"], other.counts["added"], other.waits) == (0, 64, "")
 
 
 def test_framed_symbols_of_a_simulation_require_a_constellation():
