@@ -466,9 +466,9 @@ class _Code:
         )
 
     def transfer(self, channel: str, captures: Pulses) -> Callable[[Pulses], Complexes]:
-        """Return a function that computes transfer functions of a channel from the code, without a sidelink."""
-        read, demodulator = self.part([channel], captures)
-        return lambda pulses: demodulator.symbols(read(pulses)[channel], pulses, channel=channel)
+        """Return a function that computes transfer functions of a channel from the code, 0 where it is not known."""
+        (read, demodulator), known = self.part([channel], captures), np.isin(captures, self.used)
+        return lambda pulses: demodulator.symbols(read(pulses)[channel], pulses, channel=channel) * known[pulses, None]
 
     def locks(self, channel: str) -> bool:
         """Return True if the code compresses a path in most pulses of a channel."""
