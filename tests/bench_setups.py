@@ -234,6 +234,12 @@ def _both(change: Callable[[Samples], Samples]) -> Callable[[Path], None]:
     return spoil
 
 
+def carrying(setup: Setup) -> Setup:
+    """Return a set-up whose pulses carry frames of unknown 16-QAM symbols."""
+    waveform = replace(setup.specification.waveform, code="16qam", frames=PULSES, framed=True)
+    return replace(setup, specification=replace(setup.specification, waveform=waveform))
+
+
 RIGHT = Setup(frozenset())
 SPOILT = {
     "reference unlocked": Setup(frozenset({"clock_unlocked"}), cabled(received=replace(RECEIVED, clock=_clock(2.0)))),

@@ -63,6 +63,7 @@ def test_inputs_and_outputs_of_rules_match_lineage(tiny):
         "change",
         "stack",
         "stack_image",
+        "payload",
         "terrain",
         "tiles",
         "transfer",
@@ -82,10 +83,10 @@ def test_configured_results_change_rules_and_lineage_alike(tiny):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["continuous", "swarm", "paper-lab", "paper-static"])
+@pytest.mark.parametrize("name", ["continuous", "swarm", "payload", "paper-lab", "paper-static"])
 def test_rules_match_lineage_for_other_campaigns(name, tmp_path):
     simulate(tmp_path / "campaign", preset(name))
-    assert check(tmp_path / "campaign")
+    assert ("payload" in check(tmp_path / "campaign", "pages")) == (name == "payload")
 
 
 def test_rule_files_name_manifests_and_products(tmp_path):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_setups import FLIGHT, RADAR_M, RECEIVED, RIGHT, SIDELINK_M, SPOILT, Setup, cabled
+from bench_setups import FLIGHT, RADAR_M, RECEIVED, RIGHT, SIDELINK_M, SPOILT, Setup, cabled, carrying
 from folders import edit_config
 
 import apertura as ap
@@ -78,6 +78,67 @@ def test_stuck_bit_is_distinguished_from_shifted_samples(stuck: int, shift: int,
     numerology = Numerology(1.2e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
     iq = np.random.default_rng(1).normal(scale=300, size=(20, 80, 2)).astype(np.int16)
     assert measure_channel("radar", [(iq | stuck) << shift], numerology).stuck == bits
+
+
+def test_unknown_symbols_measure_the_same_links_as_known_ones(tmp_path):
+    """Links by 16-QAM symbols decided from the sidelink equal those by the true symbols; no flag is raised."""
+    root = carrying(RIGHT).write(tmp_path / "bench", 3)
+    edit_config(root, lambda config: config.update(processing={"sidelink": "two_parameter"}))
+    decided = measure_bench(Campaign.load(root), FLIGHT)
+    edit_config(root, lambda config: config["waveform"].update(codes="symbols.npy"))
+    known = measure_bench(Campaign.load(root), FLIGHT)
+    assert decided.flags == {}
+    for node, by_table in zip(decided.nodes, known.nodes, strict=True):
+        assert node.symbols.startswith("16qam of the sidelink of uav2, SNR 30.0 dB")
+        assert node.link.path_m == pytest.approx(by_table.link.path_m, abs=1e-5)
+        assert node.link.snr == pytest.approx(by_table.link.snr, rel=1e-3)
+        assert node.link.coherence == pytest.approx(by_table.link.coherence, abs=1e-6)
+        assert node.coherence_before == pytest.approx(by_table.coherence_before, abs=1e-4)
+
+
+def test_ambiguous_symbols_measure_the_links_of_receivers_only(tmp_path):
+    """Without header and pilots, the path relative to the sidelink is right, and the own link is not measured."""
+    root = carrying(RIGHT).write(tmp_path / "bench", 3)
+    edit_config(root, lambda config: config["waveform"]["codes"].pop("frame"))
+    bench = measure_bench(Campaign.load(root), FLIGHT)
+    own, other = bench.nodes
+    assert (own.link, other.coherence_before) == (None, None)
+    assert "ambiguous by quarter turns" in own.symbols
+    assert bench.flags.keys() == {"symbols_unsure"}
+    assert next(line.measured for line in bench.lines if line.what == "path") == "not measured"
+    assert abs(bench.offsets["uav2"].offset_m - 0.911) < max(4 * bench.offsets["uav2"].std_m, 2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "others"),
+    [
+        ("another transmitter", set()),
+        ("reference unlocked", set()),
+        ("sidelink contact loose", {"symbols_unsure", "sidelink_lost"}),
+        ("transmitter's phase wanders", set()),
+        ("triggers missed", set()),
+    ],
+)
+def test_defects_raise_their_flag_with_unknown_symbols(name: str, others: set[str], tmp_path):
+    """Deciding the symbols does not hide a defect, and pulses that a node did not record are not unsure ones."""
+    bench = measured(carrying(SPOILT[name]), tmp_path / "bench")
+    assert SPOILT[name].flags & bench.flags.keys(), dict(bench.flags)
+    assert bench.flags.keys() <= SPOILT[name].flags | others, dict(bench.flags)
+    assert all(node.link for node in bench.nodes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("carrier_is", ["band_start", "band_centre"])
+def test_inverted_spectrum_of_unknown_symbols_is_found(carrier_is, tmp_path):
+    """The conjugate of a band around the carrier is a band of QAM symbols too: only its header differs."""
+    swapped = carrying(SPOILT["I and Q swapped"])
+    waveform = replace(swapped.specification.waveform, carrier_is=carrier_is)
+    bench = measured(
+        replace(swapped, specification=replace(swapped.specification, waveform=waveform)), tmp_path / "bench"
+    )
+    assert bench.flags.keys() == {"spectrum_inverted"}
+    assert abs(bench.offsets["uav2"].offset_m - 0.911) < max(4 * bench.offsets["uav2"].std_m, 2e-3)
 
 
 def test_white_phase_noise_has_the_allan_deviation_of_its_snr():

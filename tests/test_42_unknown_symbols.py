@@ -1,15 +1,16 @@
 """Campaigns whose symbols are decided from the sidelink: images, unsure pulses, bits of the frames."""
 
+import base64
 import json
 from dataclasses import replace
 
 import numpy as np
 import own_campaign
 import pytest
-from folders import edit_config, run_steps
+from folders import edit_config, export_flight, run_steps
 
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import open_stage
+from apertura.campaign.store import open_stage, read_manifest
 from apertura.check import problems
 from apertura.common.errors import CampaignError
 from apertura.core.echo.constellation import constellation
@@ -18,7 +19,11 @@ from apertura.simulation import preset, simulate
 from apertura.stages import echo, ingest
 from apertura.stages.scene import open_scene
 from apertura.stages.transfer import PairEcho
-from apertura.tools.payload import payloads, write_payload
+from apertura.tools.payload import payload, payloads, print_payload
+from apertura.tools.preview.follow import Preview
+from apertura.views.report.pictures import pictures, pictures_fused
+from apertura.views.report.step import page
+from apertura.workflow.stale import outdated_places
 
 PAIRS = "uav1-uav1", "uav1-uav2"
 
@@ -40,17 +45,23 @@ def imaged(tmp_path_factory):
     return run_steps(root, exports=False), truth
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("pair", PAIRS)
-def test_targets_focus_within_a_centimetre_by_unknown_symbols(imaged, pair):
-    """Both the monostatic pair, by the symbols of the receiver's sidelink, and the bistatic pair image five targets."""
-    campaign, truth = imaged
-    image, grid = open_stage(campaign.stage("image", "f01", pair), "image").image.values, open_scene(campaign).grid
+def assert_focused(image, grid, truth):
+    """Assert that an image shows five targets within a centimetre."""
     assert len(truth["targets"]) == 5
     for place in truth["targets"]:
         row, column = (float(value) for value in grid.pixel_of(*place))
         peak = find_peak(image, round(row), round(column))
         assert grid.spacing_m * np.hypot(peak.row - row, peak.column - column) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", PAIRS)
+def test_targets_focus_within_a_centimetre_by_unknown_symbols(imaged, pair):
+    """Both the monostatic pair, by the symbols of the receiver's sidelink, and the bistatic pair image five targets."""
+    campaign, truth = imaged
+    assert_focused(
+        open_stage(campaign.stage("image", "f01", pair), "image").image.values, open_scene(campaign).grid, truth
+    )
 
 
 @pytest.mark.slow
@@ -66,7 +77,7 @@ def test_report_states_the_choice_between_decisions_and_division(imaged):
 def test_bits_of_an_independent_campaign_are_read(tmp_path):
     """QPSK at 15 dB: header, counter, data and CRC of all frames agree with those computed by other code."""
     bits = own_campaign.write(tmp_path / "campaign", constellation="qpsk", pulses=40)["bits"]
-    (read,) = payloads(Campaign.load(tmp_path / "campaign"))
+    (read,) = payloads(Campaign.load(tmp_path / "campaign"), "f01")
     assert read.columns["intact"].all()
     assert np.array_equal(read.columns["counter"], np.arange(40))
     sent = np.packbits(bits[:, 48:-16], axis=1)
@@ -97,7 +108,7 @@ def test_monostatic_image_without_header_and_pilots_is_refused(tmp_path):
     with pytest.raises(CampaignError, match="ambiguous by quarter turns"):
         formed(root, "uav1-uav1")
     with pytest.raises(CampaignError, match="no frame format"):
-        payloads(Campaign.load(root))
+        print_payload(Campaign.load(root))
 
 
 @pytest.mark.slow
@@ -105,16 +116,48 @@ def test_payload_of_the_preset_is_that_of_its_truth(tmp_path):
     """Decided symbols of the simulated frames are those in symbols.npy; files and summary are written."""
     root = simulate(tmp_path / "campaign", preset("payload", pulses=40))
     campaign = Campaign.load(root)
-    files = write_payload(campaign, tmp_path / "out")
-    assert [path.name for path in files] == ["payload.json", "payload.png", "f01.uav2.csv", "f01.uav2.npy"]
+    files = payload(campaign, "f01")
+    assert [path.name for path in files] == ["payload.json", "payload.png", "uav2.csv", "uav2.npy"]
     (summary,) = json.loads(files[0].read_text())["nodes"]
     assert summary["intact"] == summary["frames"]
     assert summary["received_bit_s"] == pytest.approx((4096 - 64) * 20)
-    (read,) = payloads(campaign)
+    (read,) = payloads(campaign, "f01")
     true = np.load(root / "symbols.npy")[read.columns["counter"]]
     qam = constellation("16qam")
     sent = np.packbits(qam.bits(qam.decide(true))[:, 48:-16], axis=1)
-    assert np.array_equal(np.load(tmp_path / "out" / "f01.uav2.npy"), sent)
+    assert np.array_equal(np.load(root / "results/f01/payload/uav2.npy"), sent)
+
+
+@pytest.mark.slow
+def test_expected_frame_errors_are_the_mean_over_frames(tmp_path):
+    """Of frames at 20 dB and at 6 dB, all weak ones are lost and no others, as their SNR predicts."""
+    own_campaign.write(tmp_path / "campaign", pulses=96, sidelink_db=20.0, weak=slice(10, 34))
+    campaign = Campaign.load(tmp_path / "campaign")
+    (summary,) = (one.summary for one in payloads(campaign, "f01"))
+    assert summary["frame_error_rate"] == 24 / 96
+    assert summary["frame_error_rate_expected"] == pytest.approx(24 / 96, abs=0.005)
+
+
+@pytest.mark.slow
+def test_report_shows_the_payload_without_decoding_it_again(imaged, monkeypatch):
+    """The page of a flight with frames depends on the payload, shows its plot, and the error rates of both limits."""
+    campaign = imaged[0]
+    export_flight(campaign, "f01")
+    for pair in PAIRS:
+        pictures(campaign, "f01", pair)
+    pictures_fused(campaign, "f01")
+    payload(campaign, "f01")
+    monkeypatch.setattr("apertura.tools.payload.payloads", None)
+    page(campaign, "f01")
+    assert outdated_places(campaign, "payload") == []
+    print_payload(campaign)
+    html = campaign.result("f01", "report.html").read_text()
+    section = html[html.index("<h2>Payload</h2>") :]
+    encoded = base64.b64encode(campaign.result("f01", "payload", "payload.png").read_bytes()).decode()
+    assert encoded in section
+    assert "<td>uav2</td>" in section
+    sources = read_manifest(campaign.result("f01", "page.manifest.json"))["sources"]
+    assert "results/f01/payload/payload.manifest.json" in sources
 
 
 @pytest.mark.slow
@@ -145,6 +188,46 @@ def test_pulses_with_a_weak_sidelink_are_excluded(tmp_path):
     assert stage.attrs["pulses"]["reasons"]["symbols_unsure"] == 14
     assert stage.attrs["flags"]["symbols_unsure"].startswith("symbols of 14 of 96 pulses are unsure")
     assert not np.isin(np.arange(10, 24), stage.capture.values).any()
+
+
+def advanced(preview, *, ended=False):
+    """Read the files of a preview, and add all pulses that are ready; return the pairs."""
+    preview._read()
+    for pair in preview.pairs:
+        while pair.add_next(ended=ended) or pair.refine_next():
+            pass
+    return preview.pairs
+
+
+@pytest.mark.slow
+def test_preview_follows_the_sidelink_that_gives_the_symbols(tmp_path):
+    """Monostatic pulses are added as the receiver records them, and then show five targets within a centimetre."""
+    root = tmp_path / "campaign"
+    truth = own_campaign.write(root)
+    data = root / "raw" / "f01" / "uav2.sigmf-data"
+    whole = data.read_bytes()
+    data.write_bytes(b"")
+    preview = Preview(Campaign.load(root), follow=True)
+    pair = advanced(preview)[0]
+    assert (pair.name, pair.counts["added"]) == ("uav1-uav1", 0)
+    assert pair.waits == "symbols are decided from the sidelink of uav2, which has recorded 0 captures"
+    for share in (0.4, 0.7):
+        data.write_bytes(whole[: int(share * len(whole))])
+        assert 200 * share - 3 <= advanced(preview)[0].counts["added"] < 200 * share
+    data.write_bytes(whole)
+    pair = advanced(preview, ended=True)[0]
+    assert (pair.counts["added"], pair.waits, pair.flags) == (200, "", {})
+    assert_focused(pair.images[1].image, pair.images[1].grid, truth)
+
+
+@pytest.mark.slow
+def test_preview_of_ambiguous_symbols_is_bistatic(tmp_path):
+    """Without pilots and header, the monostatic pair states the reason."""
+    own_campaign.write(tmp_path / "campaign", pulses=64)
+    edit_config(tmp_path / "campaign", lambda config: config["waveform"]["codes"].pop("frame"))
+    alone, other = advanced(Preview(Campaign.load(tmp_path / "campaign"), follow=False), ended=True)
+    assert "ambiguous by quarter turns" in alone.waits
+    assert (alone.counts["added"], other.counts["added"], other.waits) == (0, 64, "")
 
 
 def test_framed_symbols_of_a_simulation_require_a_constellation():

@@ -71,6 +71,7 @@ TYPED = {
     "step interferogram": "step interferogram none",
     "step layers": "step layers f01 uav1-uav2",
     "step page": "step page f01",
+    "step payload": "step payload f01",
     "step pictures": "step pictures f01 uav1-uav2",
     "step pictures-fused": "step pictures-fused f01",
     "step profile": "step profile f01 uav1-uav2",
@@ -91,7 +92,7 @@ TYPED = {
 
 MAY_REFUSE = {
     *("align", "bench", "export stack", "export time-series", "payload", "reflectors", "step bench", "step calibrate"),
-    *("step change", "step interferogram", "step page", "step stack", "step stack-image"),
+    *("step change", "step interferogram", "step page", "step payload", "step stack", "step stack-image"),
 }
 """Commands whose requirements the tested campaign does not meet."""
 

@@ -89,6 +89,7 @@ def test_memory_requests_cover_use_and_are_below_four_times_it(run_by_snakemake)
         "change",
         "stack",
         "stack_image",
+        "payload",
         "speed_accuracy",
         "whole_chart",
     }

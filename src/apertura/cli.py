@@ -544,18 +544,12 @@ def export_time_series(
 
 
 @app.command()
-def payload(
-    campaign: CampaignFolder = HERE,
-    to: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="output folder, default: payload in the campaign folder")
-    ] = None,
-) -> None:
+def payload(campaign: CampaignFolder = HERE) -> None:
     """Read the data that the frames of a campaign carry: bits, errors and data rate of each node, over time."""
     opened = _opened(campaign)
-    from apertura.tools.payload import write_payload
+    from apertura.tools.payload import print_payload
 
-    for path in write_payload(opened, opened.root / "payload" if to is None else given(to)):
-        print(as_typed(path))
+    print(*map(as_typed, print_payload(opened)), sep="\n")
 
 
 @app.command()

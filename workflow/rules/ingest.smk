@@ -24,7 +24,7 @@ rule ingest:
 
 rule bench:
     input:
-        recordings=files(inputs.recorded_on_the_bench),
+        recordings=files(inputs.recorded),
     output:
         "results/{flight}/bench.json",
         "results/{flight}/bench.html",

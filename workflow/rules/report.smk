@@ -102,6 +102,35 @@ rule pictures_fused:
         "apertura step pictures-fused {wildcards.flight} > {log} 2>&1"
 
 
+rule payload:
+    input:
+        recordings=files(inputs.recorded),
+    output:
+        "results/{flight}/payload/payload.json",
+        report(
+            "results/{flight}/payload/payload.png",
+            caption="../report/payload.rst",
+            category="{flight}",
+            labels={"image": "all", "shows": "payload"},
+        ),
+        "results/{flight}/payload/payload.manifest.json",
+    log:
+        "results/logs/{flight}/payload.payload.log",
+    benchmark:
+        "results/benchmarks/{flight}/payload.payload.tsv"
+    conda:
+        "../../environment.yml"
+    threads: job["payload"].threads
+    resources:
+        **job["payload"].resources,
+    params:
+        **job["payload"].params,
+    message:
+        "{wildcards.flight}: reading the data in the frames"
+    shell:
+        "apertura step payload {wildcards.flight} > {log} 2>&1"
+
+
 rule page:
     input:
         pictures=each("results/{flight}/{pair}/pictures.manifest.json"),
@@ -110,6 +139,7 @@ rule page:
         fused=each("results/{flight}/fused/export.manifest.json"),
         scene="results/scene.manifest.json",
         changes=files(inputs.changes),
+        payload=each("results/{flight}/payload/payload.manifest.json"),
     output:
         report(
             "results/{flight}/report.html",

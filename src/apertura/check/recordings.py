@@ -42,7 +42,7 @@ def check_codes(examined: Examination) -> Iterator[CampaignError]:
     if all(path.is_file() and path.stat().st_size for path in examined.campaign.sent_files):
         yield from examined.transmitted_problems
     unknown = None if examined.transmitted is None else examined.transmitted.unknown
-    if unknown is not None and unknown.pilots is None and unknown.frames is None:
+    if unknown is not None and not unknown.unambiguous:
         pairs = [pair for flight in examined.campaign.image_flights for pair in flight.pairs]
         if any(map(is_monostatic, pairs)):
             yield ambiguous_symbols()

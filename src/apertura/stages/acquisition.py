@@ -207,8 +207,8 @@ def _own_sources(stage: xr.Dataset, files: Path) -> str:
     return " and ".join(own or stage.attrs["inputs"])  # files of a SigMF collection may have other names
 
 
-def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Association:
-    """Associate the pulses of a transmitter with the captures of a receiver."""
+def common_pulses(tx: Captured, rx: Captured, *, prf_hz: float, speed_m_s: float | None = None) -> Association:
+    """Associate the pulses of a transmitter, which moves at `speed_m_s`, with the captures of a receiver."""
     tx_time, rx_time = (nanoseconds(node.raw.time.values) for node in (tx, rx))
     return associate(
         tx_time,
@@ -216,6 +216,6 @@ def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Associa
         repetition_interval_s=1 / prf_hz,
         tx_frame=tx.raw.frame.values,
         rx_frame=rx.raw.frame.values,
-        speed_m_s=tx.speed_m_s,
+        speed_m_s=speed_m_s,
         where=f"{tx.files} and {rx.files}",
     )

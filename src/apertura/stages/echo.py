@@ -41,7 +41,7 @@ from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.stages.acquisition import Acquisition, common_pulses, open_acquisition
 from apertura.stages.calibration import calibrated, calibration_spec
 from apertura.stages.positions import PulsePositions, place, scene_air, stated_air
-from apertura.stages.symbols import PairSymbols
+from apertura.stages.symbols import PairSymbols, ambiguous_symbols, rows_of
 from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho, demodulator_of, recorded_echo, save_transfer
 from apertura.stages.transmitted import Transmitted, transmitted
@@ -107,7 +107,7 @@ def pair_echo(
     Pulses of a hover are excluded unless `hovers` is True, as in `apertura.stages.positions.place`. `source`: node
     whose sidelink gives unknown symbols of the pulses, by default the receiver.
     """
-    pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
+    pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz, speed_m_s=tx.speed_m_s)
     repeats = rx.raw.repeats.values[pulses.rx_index]
     paired = np.flatnonzero(~pulses.outlier & ~repeats)
     positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]], hovers=hovers)
@@ -117,7 +117,13 @@ def pair_echo(
         frames, displaced = _placed((tx, rx), pulses.rx_index[paired], frames, sent)
         decided, basis = dict[str, Any](), tx.frames.basis
     else:
-        decision = PairSymbols.of((tx, rx), source or rx, sent, pulses, paired, processing.accuracy_db)
+        if tx.name == rx.name and not sent.unknown.unambiguous:
+            raise ambiguous_symbols()
+        if source is None or source is rx:
+            source, rows = rx, pulses.rx_index
+        else:
+            rows = rows_of(tx, source, prf_hz=sent.waveform.prf_hz)[pulses.tx_index]
+        decision = PairSymbols.of(source, sent, rows[paired], processing.accuracy_db)
         usable = decision.usable()
         sent, frames, paired = decision.sent, decision.rows[usable], paired[usable]
         decided, displaced = (
@@ -125,10 +131,7 @@ def pair_echo(
             Flags(decision.symbols.flags(usable[decision.rows >= 0])),
         )
         basis = f"captures of {decision.source}"
-        if processing.sidelink == "auto":
-            processing = processing.model_copy(
-                update={"sidelink": "divide" if decision.symbols.divides else "least_noise"}
-            )
+        processing = processing.model_copy(update={"sidelink": decision.sidelink_method(processing.sidelink)})
     at = tx.raw.time.values[pulses.tx_index[paired]]
     measured, sidelink_m = _transfer((tx, rx), (pulses.rx_index[paired], frames), at, sent, processing, air)
     at = at[measured.kept]

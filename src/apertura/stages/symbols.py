@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 
 from apertura.campaign.config import CONFIG
 from apertura.common.errors import CampaignError
-from apertura.core.echo.association import Association
 from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.decided_symbols import SidelinkSymbols
 from apertura.core.echo.frame_codes import Inverses
 from apertura.core.quality.budget import strictest_accuracy_db
-from apertura.stages.acquisition import Acquisition, Captured, common_pulses
+from apertura.stages.acquisition import Captured, common_pulses
 from apertura.stages.transmitted import Transmitted
 
 
@@ -63,40 +62,25 @@ class PairSymbols:
 
     @classmethod
     def of(
-        cls,
-        nodes: tuple[Acquisition, Acquisition],
-        source: Acquisition,
-        sent: Transmitted,
-        pulses: Association,
-        paired: NDArray[np.int64],
-        accuracy_db: float | Literal["auto"],
+        cls, source: Captured, sent: Transmitted, rows: NDArray[np.int64], accuracy_db: float | Literal["auto"]
     ) -> "PairSymbols":
-        """Return the symbols of the `paired` pulses of a transmitter and a receiver, from the sidelink of `source`.
+        """Return the symbols of pulses that the captures `rows` of `source` contain in their sidelink.
 
         Raises
         ------
         CampaignError
-            If no direct path is detected, or the phase of the symbols of a monostatic pair is ambiguous.
+            If the source recorded no sidelink, or no direct path is detected in it.
         """
-        tx, rx = nodes
+        name = source.files.name
         if "sidelink" not in source.raw.attrs["channels"]:
             raise CampaignError(
-                f"node {source.name} recorded no channel named 'sidelink'",
+                f"node {name} recorded no channel named 'sidelink'",
                 where=source.recording,
                 expected="the direct path, from which unknown symbols are decided",
                 remedy="Set waveform.codes.node to a node with a sidelink, or name the channel in apertura:channels.",
             )
         symbols = decided_symbols(source, sent, accuracy_db)
-        if source.name == rx.name:
-            rows = pulses.rx_index[paired]
-        else:
-            both = common_pulses(tx, source, prf_hz=sent.waveform.prf_hz)
-            row_of = np.full(len(tx.raw.time), -1)
-            row_of[both.tx_index] = both.rx_index
-            rows = row_of[pulses.tx_index[paired]]
-        if tx.name == rx.name and not symbols.unambiguous:
-            raise ambiguous_symbols()
-        return cls(with_symbols(sent, source, symbols), rows, symbols, source.name)
+        return cls(with_symbols(sent, source, symbols), rows, symbols, name)
 
     def usable(self) -> NDArray[np.bool_]:
         """Return True for pulses whose symbols are used; all pulses are decided, block by block."""
@@ -105,9 +89,31 @@ class PairSymbols:
             usable[block] = self.symbols.usable(self.symbols.decisions(self.rows[block]))
         return usable
 
+    def header_errors(self, captures: NDArray[np.int64]) -> float:
+        """Return the fraction of wrong bits in the headers of captures of the source; 0 without a frame format."""
+        unknown = self.sent.unknown
+        if unknown is None or unknown.frames is None:
+            return 0.0
+        labels = self.symbols.decisions(captures).labels[:, self.symbols.decider.data_places]
+        frames = unknown.frames.parsed(unknown.constellation.bits(labels))
+        return float(frames.header_errors.mean() / unknown.frames.header.size)
+
+    def sidelink_method(self, requested: str) -> str:
+        """Return the sidelink correction; of `auto`, division if symbols are unsure, else the one with least noise."""
+        if requested != "auto":
+            return requested
+        return "divide" if self.symbols.divides else "least_noise"
+
     def report(self, usable: NDArray[np.bool_]) -> dict[str, Any]:
         """Return the report on the decisions."""
         return {"node": self.source, **self.symbols.report(usable)}
+
+
+def rows_of(tx: Captured, source: Captured, *, prf_hz: float) -> NDArray[np.int64]:
+    """Return the capture of `source` that contains the pulse of each capture of a transmitter; -1 if there is none."""
+    both, rows = common_pulses(tx, source, prf_hz=prf_hz), np.full(len(tx.raw.time), -1)
+    rows[both.tx_index[~both.outlier]] = both.rx_index[~both.outlier]
+    return rows
 
 
 def ambiguous_symbols() -> CampaignError:
@@ -120,6 +126,6 @@ def ambiguous_symbols() -> CampaignError:
     )
 
 
-def with_symbols(sent: Transmitted, source: Acquisition, symbols: SidelinkSymbols) -> Transmitted:
+def with_symbols(sent: Transmitted, source: Captured, symbols: SidelinkSymbols) -> Transmitted:
     """Return a transmitted signal whose rows are the decided symbols of the captures of `source`."""
     return replace(sent, inverses=Inverses(len(source.raw.start), symbols.inverse))

@@ -144,14 +144,16 @@ class UnknownSymbols:
         Known symbols; None: there are no pilots.
     frames
         Format of the bits; None: not configured.
-    node
-        Node whose sidelink gives the symbols of monostatic images; None: chosen.
     """
 
     constellation: Constellation
     pilots: Pilots | None
     frames: FrameFormat | None
-    node: str | None
+
+    @property
+    def unambiguous(self) -> bool:
+        """True if pilots or a header determine the phase of the symbols."""
+        return self.pilots is not None or self.frames is not None
 
     @classmethod
     def of(cls, codes: SidelinkCodes, subcarriers: int, pilots: Path | None) -> "UnknownSymbols":
@@ -179,7 +181,7 @@ class UnknownSymbols:
                     expected=f"a header of at least {FEWEST_KNOWN} symbols, and room for data",
                     remedy="Correct header and counter_bits.",
                 )
-        return cls(qam, known, frames, codes.node)
+        return cls(qam, known, frames)
 
 
 FEWEST_KNOWN = 4

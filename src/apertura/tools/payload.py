@@ -1,4 +1,4 @@
-"""Data that the frames of a campaign carry: bits, errors and data rate of each node, from its sidelink."""
+"""Rule `payload` and `apertura payload`: data in the frames of a flight, with errors and data rate of each node."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,15 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from apertura.campaign.config import CONFIG, OfdmWaveform, SidelinkCodes
+from apertura.campaign.config import CONFIG, OfdmWaveform
 from apertura.campaign.folder import Campaign
-from apertura.common.atomic import made_folder, replacement, write_json
+from apertura.campaign.store import open_listed, record_files
+from apertura.common.atomic import replacement, write_json
 from apertura.common.errors import CampaignError
+from apertura.common.provenance import Provenance
 from apertura.common.tables import write_table
 from apertura.common.units import decibels, seconds_since
 from apertura.core.echo.captures import blocks_of
@@ -22,17 +23,15 @@ from apertura.core.echo.constellation import constellation
 from apertura.stages.acquisition import Captured
 from apertura.stages.ingest import captures_of, checked_recording
 from apertura.stages.symbols import decided_symbols
+from apertura.stages.tags import tags_of
 from apertura.stages.transmitted import Transmitted, UnknownSymbols, transmitted
-from apertura.tools.chart.pareto import save_png
+from apertura.views.quality import PAYLOAD, payload_row
+from apertura.views.report.sheet import BLUE, GREEN, ORANGE, RED, SKY, column_of, sheet, thinned
+from apertura.workflow.lineage import result_of
+from apertura.workflow.rule_inputs import JobScope, Scope, has_frames
+from apertura.workflow.stale import outdated_places
 
-_PRINTED = {
-    **{name: name for name in ("flight", "node", "frames", "intact")},
-    "snr_db": "SNR dB",
-    "evm_db": "EVM dB",
-    "symbol_error_rate_expected": "SER",
-    "received_bit_s": "bit/s",
-}
-"""Key of the summary → heading of the printed table."""
+_COLOURS = (BLUE, ORANGE, GREEN, RED, SKY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,7 @@ class NodePayload:
     data
         (frame, byte) uint8, data bits of each frame, padded with zeros to whole bytes.
     summary
-        Names of flight and node, numbers of frames and errors, medians of SNR and EVM, and data rates.
+        Name of the node, numbers of frames and errors, medians of SNR and EVM, and data rates.
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -63,36 +62,81 @@ class NodePayload:
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def payloads(campaign: Campaign) -> list[NodePayload]:
-    """Return the frames of all nodes that recorded a sidelink.
+def payload(campaign: Campaign, flight: str) -> Sequence[Path]:
+    """Write the frames of a flight to results/<flight>/payload: payload.json, payload.png, table and data of each node.
 
     Raises
     ------
     CampaignError
         If the waveform has no frame format, or no node recorded a sidelink.
     """
-    waveform = campaign.settings.waveform
-    codes = getattr(waveform, "codes", None)
-    if not (isinstance(waveform, OfdmWaveform) and isinstance(codes, SidelinkCodes) and codes.frame is not None):
+    lineage = result_of(campaign, "payload", flight).begin(campaign.root)
+    read, folder = payloads(campaign, flight), campaign.result(flight, "payload")
+    files: list[Path] = [folder / "payload.json", folder / "payload.png"]
+    write_json(files[0], {"flight": flight, "nodes": [one.summary for one in read]})
+    origin = Provenance.of(lineage.modules, {}, settings=lineage.result.settings)
+    title = f"{campaign.settings.campaign}, payload of flight {flight}"
+    draw_payload(files[1], read, title=title, tags=tags_of(origin, lineage))
+    for one in read:
+        table, data = (folder / f"{one.summary['node']}.{suffix}" for suffix in ("csv", "npy"))
+        write_table(table, one.rows, digits=4)
+        with replacement(data) as temporary, temporary.open("wb") as file:
+            np.save(file, one.data)
+        files += [table, data]
+    record_files(campaign.root / lineage.result.manifest, files, lineage)
+    return files
+
+
+def print_payload(campaign: Campaign) -> list[Path]:
+    """Print the frames of all flights; flights without an up-to-date result are read first.
+
+    Raises
+    ------
+    CampaignError
+        If the waveform has no frame format, or no node of a flight recorded a sidelink.
+    """
+    if not has_frames(JobScope(campaign, Scope.CAMPAIGN, ())):
         raise CampaignError(
             "no frame format",
             where=f"{CONFIG}: waveform.codes.frame",
             expected="waveform.codes with source: sidelink, constellation and frame",
             remedy="Describe header, counter and check sum of the transmitted frames.",
         )
-    sent, read = transmitted(campaign, waveform), list[NodePayload]()
+    for where in outdated_places(campaign, "payload"):
+        payload(campaign, *where)
+    table, files = Table("flight", *PAYLOAD), list[Path]()
     for flight in campaign.flights:
-        for node in flight.recorded:
-            recording = checked_recording(campaign, flight.name, node)
-            if "sidelink" in recording.channels:
-                raw = captures_of(recording, campaign, node=node)
-                name, order = f"raw/{flight.name}/{node}", campaign.settings.iq_of(node)
-                captured = Captured.of(raw, recording.samples.path, Path(name), name, sent, order=order)
-                names = {"flight": flight.name, "node": node}
-                read.append(_payload(captured, sent, campaign.settings.processing.accuracy_db, names))
+        folder = campaign.result(flight.name, "payload")
+        report = open_listed(folder / "payload.json", folder / "payload.manifest.json")
+        for summary in report["nodes"]:
+            table.add_row(flight.name, *payload_row(summary))
+        files += [folder / "payload.json", folder / "payload.png"]
+    Console().print(table)
+    return files
+
+
+def payloads(campaign: Campaign, flight: str) -> list[NodePayload]:
+    """Return the frames of all nodes that recorded a sidelink in a flight.
+
+    Raises
+    ------
+    CampaignError
+        If no node recorded a sidelink.
+    """
+    waveform = campaign.settings.waveform
+    if not isinstance(waveform, OfdmWaveform):
+        raise TypeError("the waveform has no symbols")
+    sent, read = transmitted(campaign, waveform), list[NodePayload]()
+    for node in campaign.flight(flight).recorded:
+        recording = checked_recording(campaign, flight, node)
+        if "sidelink" in recording.channels:
+            raw = captures_of(recording, campaign, node=node)
+            name, order = f"raw/{flight}/{node}", campaign.settings.iq_of(node)
+            captured = Captured.of(raw, recording.samples.path, Path(name), name, sent, order=order)
+            read.append(_payload(captured, sent, campaign.settings.processing.accuracy_db, node))
     if not read:
         raise CampaignError(
-            "no node recorded a channel named 'sidelink'",
+            f"no node recorded a channel named 'sidelink' in flight {flight}",
             where="raw",
             expected="a receiver with a sidelink, from which the symbols are decided",
             remedy="Correct apertura:channels.",
@@ -100,7 +144,7 @@ def payloads(campaign: Campaign) -> list[NodePayload]:
     return read
 
 
-def _payload(captured: Captured, sent: Transmitted, accuracy_db: Any, names: Mapping[str, str]) -> NodePayload:
+def _payload(captured: Captured, sent: Transmitted, accuracy_db: Any, node: str) -> NodePayload:
     """Return the frames in the sidelink of a recording, decided block by block."""
     unknown = sent.unknown
     if unknown is None or unknown.frames is None:
@@ -121,7 +165,7 @@ def _payload(captured: Captured, sent: Transmitted, accuracy_db: Any, names: Map
             "intact": frames.intact & detected,
         })  # fmt: skip
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    summary = {**names, **_summary(columns, unknown, sent.waveform.prf_hz)}
+    summary = {"node": node, **_summary(columns, unknown, sent.waveform.prf_hz)}
     return NodePayload({"time": captured.raw.time.values, **columns}, np.concatenate(data), summary)
 
 
@@ -135,12 +179,12 @@ def _summary(columns: Mapping[str, NDArray[Any]], unknown: UnknownSymbols, prf_h
     measured = dict[str, float | None](snr_db=None, evm_db=None, header_bit_error_rate=None)
     if seen.any():
         # eqs. 3 and 15
-        expected = float(qam.symbol_error_rate(10 ** (columns["snr_db"][seen] / 10)).mean())
+        expected = qam.symbol_error_rate(10 ** (columns["snr_db"][seen] / 10))
         measured = {name: round(float(np.median(columns[name][seen])), 2) for name in ("snr_db", "evm_db")}
         measured["header_bit_error_rate"] = float(columns["header_errors"][seen].mean() / frames.header.size)
-        measured["symbol_error_rate_expected"] = float(f"{expected:.3e}")
+        measured["symbol_error_rate_expected"] = float(f"{expected.mean():.3e}")
         lost = 1 - (1 - expected) ** (frames.total_bits // qam.bits_per_symbol)
-        measured["frame_error_rate_expected"] = float(f"{lost:.3e}")
+        measured["frame_error_rate_expected"] = float(f"{lost.mean():.3e}")
     return {
         "constellation": qam.name,
         **counts,
@@ -152,40 +196,26 @@ def _summary(columns: Mapping[str, NDArray[Any]], unknown: UnknownSymbols, prf_h
     }
 
 
-def write_payload(campaign: Campaign, folder: Path) -> list[Path]:
-    """Write payload.json, payload.png, and table and data of each node into a folder; print a summary."""
-    read, root = payloads(campaign), made_folder(folder)
-    files: list[Path] = [root / "payload.json", root / "payload.png"]
-    write_json(files[0], {"campaign": campaign.settings.campaign, "nodes": [one.summary for one in read]})
-    _draw(read, files[1])
-    table = Table(*_PRINTED.values())
-    for one in read:
-        name = "{flight}.{node}".format_map(one.summary)
-        write_table(root / f"{name}.csv", one.rows, digits=4)
-        with replacement(root / f"{name}.npy") as temporary, temporary.open("wb") as file:
-            np.save(file, one.data)
-        files += [root / f"{name}.csv", root / f"{name}.npy"]
-        table.add_row(*(str(one.summary.get(key)) for key in _PRINTED))
-    Console().print(table)
-    return files
-
-
-def _draw(read: Sequence[NodePayload], path: Path) -> None:
-    """Plot SNR and lost frames of each node over time, one panel for each flight."""
-    flights = list(dict.fromkeys(one.summary["flight"] for one in read))
-    figure = Figure(figsize=(10, 1.2 + 2.8 * len(flights)), layout="constrained")
-    for axes, flight in zip(figure.subplots(len(flights), squeeze=False)[:, 0], flights, strict=True):
-        nodes = [one for one in read if one.summary["flight"] == flight]
-        start = min(one.columns["time"][0] for one in nodes)
-        for one in nodes:
-            time_s, snr_db = seconds_since(one.columns["time"], start), one.columns["snr_db"]
-            lost, label = ~one.columns["intact"], one.summary["node"]
-            line = axes.plot(time_s, snr_db, linewidth=1, label=f"{label}: {(~lost).sum()} intact")[0]
-            level = np.where(np.isfinite(snr_db), snr_db, 0.0)
-            axes.plot(time_s[lost], level[lost], "x", color=line.get_color(), label=f"{label}: {lost.sum()} lost")
-        qam = constellation(nodes[0].summary["constellation"])
-        least_db = decibels(qam.least_snr)
-        axes.axhline(least_db, color="0.4", linestyle="--", label=f"{qam.name}: least SNR, {least_db:.1f} dB")
-        axes.set(title=f"Flight {flight}", ylabel="SNR per subcarrier, dB", xlabel="Time since the first frame, s")
-        axes.legend(loc="best", fontsize="small")
-    save_png(figure, path)
+def draw_payload(path: Path, read: Sequence[NodePayload], *, title: str, tags: Mapping[str, str]) -> None:
+    """Plot SNR, error vector magnitude and lost frames of each node of a flight over time."""
+    start, qam = min(one.columns["time"][0] for one in read), constellation(read[0].summary["constellation"])
+    with sheet(path, 4.6, title=title, tags=tags) as figure:
+        snr, evm = column_of(figure, 2)
+        for number, (one, colour) in enumerate(zip(read, _COLOURS * len(read), strict=False)):
+            time_s, node = seconds_since(one.columns["time"], start), one.summary["node"]
+            drawn, lost = thinned(len(time_s)), np.flatnonzero(~one.columns["intact"])
+            for axes, name in ((snr, "snr_db"), (evm, "evm_db")):
+                axes.plot(time_s[drawn], one.columns[name][drawn], ".-", ms=2, lw=0.6, color=colour, label=node)
+            # lost frames may have no SNR: marks at a constant height above the time axis
+            marked = time_s[lost[thinned(len(lost))]] if len(lost) else lost
+            height = np.full(len(marked), 0.04 + 0.05 * number)
+            label = f"{node}: {len(lost)} of {len(time_s)} frames lost"
+            snr.plot(marked, height, "x", ms=4, color=colour, label=label, transform=snr.get_xaxis_transform())
+        least_db, most_db = decibels(qam.least_snr), 2 * decibels(qam.decided(qam.least_snr).evm)
+        snr.axhline(least_db, color="0.4", ls="--", label=f"least SNR of {qam.name}: {least_db:.1f} dB")
+        evm.axhline(most_db, color="0.4", ls="--", label=f"EVM at the least SNR: {most_db:.1f} dB")
+        snr.margins(y=0.2)
+        snr.set(ylabel="SNR per subcarrier, dB", title=title)
+        evm.set(ylabel="error vector magnitude, dB", xlabel="time since the first frame, s")
+        for axes in (snr, evm):
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))

@@ -21,6 +21,7 @@ VERDICTS = ("image", "verdict", "peak loss", "expected loss", "numerical error",
 DECISIONS = ("decision", "value", "reason")
 BUDGET = ("cause", "size", "peak loss", "displacement", "phase")
 FLAGGED = ("flag", "images", "measurement", "meaning", "advice")
+PAYLOAD = ("node", "frames", "intact", "SNR, dB", "EVM, dB", "SER", "FER", "bit/s")
 """Table headers."""
 
 
@@ -324,6 +325,15 @@ def flag_rows(reports: Mapping[str, Report]) -> list[Cells]:
         )
         for flag in raised_flags(reports)
     ]
+
+
+def payload_row(summary: Report) -> Cells:
+    """Return the table row of a node in payload.json; NaN: no direct path was detected in any frame."""
+    formats = {"frames": "d", "intact": "d", "snr_db": ".1f", "evm_db": ".1f"}
+    formats |= {"symbol_error_rate_expected": ".1e", "frame_error_rate": ".3g", "received_bit_s": ".0f"}
+    values = {name: summary.get(name) for name in formats}
+    cells = (format(float("nan") if values[name] is None else values[name], form) for name, form in formats.items())
+    return summary["node"], *cells
 
 
 def explained_flags(flags: Mapping[str, str]) -> dict[str, str]:

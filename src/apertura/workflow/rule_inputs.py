@@ -159,6 +159,12 @@ def of_samples(scope: JobScope) -> bool:
     return is_sampled(scope.campaign)
 
 
+def has_frames(scope: JobScope) -> bool:
+    """Return True if the format of the frames that the unknown symbols carry is configured."""
+    codes = getattr(scope.campaign.settings.waveform, "codes", None)
+    return getattr(codes, "frame", None) is not None
+
+
 def adds_up(scope: JobScope) -> bool:
     """Return True if a flight has several pairs and therefore sums."""
     from apertura.campaign.config import FUSED
@@ -171,12 +177,12 @@ def recording(scope: JobScope) -> Iterable[str]:
     return map(scope.campaign.relative, scope.campaign.promised_files(*scope.where))
 
 
-def recorded_on_the_bench(scope: JobScope) -> Iterable[str]:
+def recorded(scope: JobScope) -> Iterable[str]:
     """Return the recordings of a flight, and the file of the transmitted signal."""
     campaign, flight = scope.campaign, scope.campaign.flight(scope.where[0])
     if not is_sampled(campaign):
         return []
-    files = (path for node in flight.nodes for path in campaign.promised_files(flight.name, node))
+    files = (path for node in flight.recorded for path in campaign.promised_files(flight.name, node))
     return map(campaign.relative, (*files, *campaign.sent_files))
 
 

@@ -59,6 +59,16 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     return stale
 
 
+def outdated_places(campaign: Campaign, name: str) -> list[tuple[str, ...]]:
+    """Return the wildcard values of the jobs of a result whose results are missing or out of date."""
+    stale = stale_results(campaign)
+    return [
+        where
+        for result_name, where, result in places_of(campaign)
+        if result_name == name and (result.manifest in stale or not (campaign.root / result.manifest).is_file())
+    ]
+
+
 def without_outdated(campaign: Campaign) -> Campaign:
     """Return the campaign with its out-of-date results marked, so that plans are based on config and files instead."""
     return replace(campaign, outdated=frozenset(stale_results(campaign)))

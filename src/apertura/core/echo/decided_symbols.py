@@ -102,11 +102,6 @@ class SidelinkSymbols:
         """True if division by the noisy sidelink has the smaller error, because most decisions are unsure (eq. 7)."""
         return self.snr < self.decider.constellation.least_snr
 
-    @property
-    def unambiguous(self) -> bool:
-        """True if pilots or a header determine the phase of the symbols."""
-        return self.decider.pilots is not None or self.known is not None
-
     def received(self, captures: Pulses) -> Complexes:
         """Return the received symbols of the sidelink in captures, (pulse, subcarrier) complex64."""
         samples = as_complex(self.read(captures)["sidelink"][:, : self.symbol_samples])

@@ -365,6 +365,7 @@ def measure_link(
     *,
     divided: bool,
     prefix_cells: int | None = None,
+    noise_gain: Floats | float = 1.0,
 ) -> MeasuredLink | None:
     """Measure the strongest path of a channel over all pulses; None if fewer than two pulses lock.
 
@@ -382,6 +383,8 @@ def measure_link(
         True if transfer functions are divided by the sidelink, whose delay is then zero.
     prefix_cells
         Largest delay in cells; None permits delays of either sign up to half of all cells.
+    noise_gain
+        (subcarrier,) float64, mean of 1/|c|² over the pulses, by which the code shapes white noise.
 
     Notes
     -----
@@ -436,8 +439,8 @@ def measure_link(
     noise = float(np.median(changes)) / (1 - 1 / (9 * (used - 1))) ** 3
     mean = total / used
     scatter = float(np.std(relative[locked]))
-    groups = sampled_pulses(used)
-    sampled = runs(groups, [form(numbers[locked][group]) for group in groups])
+    groups, white = sampled_pulses(used), 1 / np.sqrt(noise_gain)
+    sampled = runs(groups, [form(numbers[locked][group]) * white for group in groups])
     interference = Interference.measured(sampled, numerology.frequency_hz, np.full(subcarriers, 1 / subcarriers))
     direct = _at_sidelink(mean, delay, noise / used) if divided else None
     # 4. Path from the mean under a Hann window; otherwise sidelobes of other arrivals displace the path by millimetres.

@@ -1,9 +1,10 @@
 """Measurement of a flight of kind bench: channels and clocks of nodes, links of pairs, and lines of the verdict."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,10 +21,10 @@ from apertura.core.echo.captures import (
     Samples,
     Saturation,
     blocks_of,
-    conjugates,
     spread,
 )
 from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of
+from apertura.core.echo.frame_codes import sampled_rows
 from apertura.core.echo.interference import EXCESS_DB
 from apertura.core.echo.transfer import (
     Demodulator,
@@ -66,10 +67,12 @@ from apertura.methods.bench.links import (
 )
 from apertura.stages.acquisition import Captured
 from apertura.stages.ingest import captures_of, checked_recording
+from apertura.stages.symbols import PairSymbols, ambiguous_symbols, rows_of
 from apertura.stages.transmitted import Transmitted, transmitted
 
 _CHANNELS = ("radar", "sidelink")
 _STRETCH = 256  # consecutive captures in each of `GROUPS` groups of a recording
+_FEW_ERRORS = 0.1  # fraction of wrong bits in the header with which the order of I and Q is confirmed
 _EVERY_CAPTURE = 4096
 """Maximum number of captures of a node whose samples are analysed; longer recordings are sampled evenly."""
 
@@ -116,7 +119,9 @@ class BenchNode:
         Strongest path: for the transmitter in its own echo, for a receiver in its echo divided by the sidelink; None if
         no path is found.
     coherence_before
-        Γ of the radar channel without sidelink correction.
+        Γ of the radar channel without sidelink correction; None for ambiguous symbols.
+    symbols
+        Source and quality of symbols that are decided from a sidelink; empty if the symbols are known.
     flags
         Flags of all measurements.
     """
@@ -130,6 +135,7 @@ class BenchNode:
     contact: Contact | None
     link: MeasuredLink | None
     coherence_before: float | None
+    symbols: str
     flags: Flags
 
 
@@ -210,13 +216,15 @@ class Bench:
             yield line(
                 of, "I/Q image", f"{channel.image_db:.1f} dB", f"{limit_db:.0f} dB", *({"channel_image"} & flags)
             )
+        if node.symbols:
+            yield line(node.name, "data symbols", node.symbols, "decided in all pulses", "symbols_unsure")
         yield from self._received(node, line)
         if node.link is not None:
             yield from self._link(node, node.link, line)
         else:
-            yield line(
-                self.pair(node.name), "path", "no path above the noise", "one path", "link_weak", "sidelink_lost"
-            )
+            problem = "no path above the noise" if "symbols_unsure" not in raised else "not measured"
+            names = "link_weak", "sidelink_lost", "symbols_unsure"
+            yield line(self.pair(node.name), "path", problem, "one path", *names)
 
     def _received(self, node: BenchNode, line: Any) -> Iterator[VerdictLine]:
         """Yield the lines for a receiver's clock and sidelink."""
@@ -382,9 +390,9 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
             expected="a waveform recorded as samples, from which clocks and channels are measured",
             remedy="Remove flights of kind bench from flights.tsv.",
         )
-    flown, sent = campaign.flight(flight), transmitted(campaign, waveform)
+    flown, coded = campaign.flight(flight), _Coded(campaign, flight, transmitted(campaign, waveform))
     names = [name for name in flown.participants if name in flown.nodes]
-    nodes = tuple(_node(campaign, flight, name, sent, is_transmitter=name == flown.transmitter) for name in names)
+    nodes = tuple(_node(coded, name) for name in names)
     due = max((node.triggers.due for node in nodes), default=0)
     # `beyond`: pulses that other nodes recorded before this node started or after it stopped
     counts = [replace(node.triggers, beyond=due - node.triggers.due) for node in nodes]
@@ -421,61 +429,170 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     )  # fmt: skip
 
 
-def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_transmitter: bool) -> BenchNode:
-    if sent.unknown is not None:
-        raise CampaignError(
-            "symbols that are decided from the sidelink",
-            where=f"{CONFIG}: waveform.codes",
-            expected="known symbols, by which a bench test measures links one by one",
-            remedy="Transmit known symbols on the bench, and configure their file or generator.",
+@dataclass(frozen=True, eq=False)
+class _Code:
+    """Code of the captures of a node, known or decided.
+
+    `captured` is read in the order of I and Q in which it contains the code. `rows`: (capture,) int64, rows of the
+    inverse spectra of `sent`. `used`: captures whose symbols are known. `decided`: decided symbols; None: known ones.
+    """
+
+    captured: Captured
+    sent: Transmitted
+    rows: Pulses
+    used: Pulses
+    decided: PairSymbols | None = None
+
+    @classmethod
+    def of(cls, captured: Captured, decided: PairSymbols) -> "_Code":
+        """Return the decided code of captures; raise CampaignError if it is decided in fewer than two."""
+        used = np.flatnonzero(decided.usable())
+        if len(used) < 2:
+            raise CampaignError(
+                f"symbols are decided in {len(used)} of {len(decided.rows)} pulses",
+                where=captured.recording,
+                expected=f"pulses that the sidelink of {decided.source} contains above the SNR of the constellation",
+                remedy="Check antenna, gain and reflections of the sidelink.",
+            )
+        return cls(captured, decided.sent, decided.rows, used, decided)
+
+    def part(self, channels: Sequence[str], captures: Pulses) -> tuple[Read, Demodulator]:
+        """Return reader and demodulator of a part of the captures."""
+        inverses, rows = self.sent.inverses, self.rows[captures]
+        length, numerology = self.sent.waveform.capture_samples, self.captured.numerology
+        return (
+            self.captured.reader(channels, captures),
+            Demodulator(lambda pulses: inverses.at(rows[pulses]), numerology, length),
         )
-    recording = checked_recording(campaign, flight, name)
-    raw = captures_of(recording, campaign, node=name)
-    where = f"raw/{flight}/{name}"
-    order = campaign.settings.iq_of(name)
-    captured = Captured.of(raw, recording.samples.path, Path(where), where, sent, order=order)
-    time_s = seconds_since(raw.time.values, raw.time.values[0])
+
+    def transfer(self, channel: str, captures: Pulses) -> Callable[[Pulses], Complexes]:
+        """Return a function that computes transfer functions of a channel from the code, 0 where it is not known."""
+        (read, demodulator), known = self.part([channel], captures), np.isin(captures, self.used)
+        return lambda pulses: demodulator.symbols(read(pulses)[channel], pulses, channel=channel) * known[pulses, None]
+
+    def locks(self, channel: str) -> bool:
+        """Return True if the code compresses a path in most pulses of a channel."""
+        pulses = self.used[np.concatenate(spread(len(self.used), groups=4, each=16))]
+        contact = measure_contact(channel, self.transfer(channel, pulses), len(pulses))
+        return contact is not None and 2 * contact.dropouts < contact.pulses
+
+    @property
+    def noise_gain(self) -> Floats:
+        """(subcarrier,) float64, mean of 1/|c|² over the pulses, from at most 64 of them."""
+        inverse = self.sent.inverses.at(self.rows[self.used][sampled_rows(len(self.used))])
+        gain = np.square(np.abs(inverse)).mean(axis=0, dtype=np.float64)
+        return np.where(gain > 0, gain, 1.0)
+
+    @property
+    def symbols(self) -> str:
+        """Source and quality of decided symbols; empty for known ones."""
+        if self.decided is None:
+            return ""
+        report = self.decided.report(np.isin(np.arange(len(self.rows)), self.used))
+        return (
+            f"{report['constellation']} of the sidelink of {report['node']}, SNR {report['snr_db']:.1f} dB, EVM "
+            f"{report['evm_db']:.1f} dB, decided in {len(self.used)} of {len(self.rows)} pulses"
+        )
+
+
+class _Coded:
+    """Recordings of a flight of kind bench, and the codes of their captures."""
+
+    def __init__(self, campaign: Campaign, flight: str, sent: Transmitted) -> None:
+        self.campaign, self.flight, self.sent = campaign, campaign.flight(flight), sent
+        self.accuracy_db = strictest_accuracy_db(campaign.settings.processing.accuracy_db)
+        self.captured, self.code = cache(self._captured), cache(self._code)
+
+    def _captured(self, name: str) -> Captured:
+        recording, where = checked_recording(self.campaign, self.flight.name, name), f"raw/{self.flight.name}/{name}"
+        raw, order = captures_of(recording, self.campaign, node=name), self.campaign.settings.iq_of(name)
+        return Captured.of(raw, recording.samples.path, Path(where), where, self.sent, order=order)
+
+    def _code(self, name: str) -> _Code:
+        """Return the code of a node; raise CampaignError if unknown symbols cannot be decided."""
+        captured, transmitter, unknown = self.captured(name), self.flight.transmitter, self.sent.unknown
+        every, channel = np.arange(len(captured.raw.start)), "radar" if name == transmitter else "sidelink"
+        # read as configured, or else the complex conjugates
+        orders = captured, replace(captured, order="conjugate" if captured.order == "complex" else "complex")
+        if unknown is None:
+            code = _Code(captured, self.sent, captured.frames.numbers, every)
+        else:
+            if name == transmitter and not unknown.unambiguous:
+                raise ambiguous_symbols()
+            source = self.campaign.symbol_source(self.flight.name, f"{transmitter}-{name}")
+            if source == name:
+                return self._decided(orders, every)
+            of_source = self.code(source)
+            rows = rows_of(captured, of_source.captured, prf_hz=self.sent.waveform.prf_hz)
+            code = _Code.of(captured, replace(cast("PairSymbols", of_source.decided), rows=rows))
+        conjugate = replace(code, captured=orders[1])
+        return conjugate if not code.locks(channel) and conjugate.locks(channel) else code
+
+    def _decided(self, orders: Sequence[Captured], every: Pulses) -> _Code:
+        """Return the code in the sidelink of a node, of the order of I and Q in which the header has fewer errors."""
+        tested, found, problems = np.concatenate(spread(len(every), groups=4, each=16)), [], list[CampaignError]()
+        for captured in orders:
+            try:
+                decided = PairSymbols.of(captured, self.sent, every, self.accuracy_db)
+            except CampaignError as problem:
+                problems.append(problem)
+            else:
+                found.append((decided.header_errors(tested), captured, decided))
+                if found[-1][0] < _FEW_ERRORS:
+                    break
+        if not found:
+            raise problems[0]
+        return _Code.of(*min(found, key=lambda one: one[0])[1:])
+
+
+def _node(coded: _Coded, name: str) -> BenchNode:
+    sent, captured, processing = coded.sent, coded.captured(name), coded.campaign.settings.processing
+    is_transmitter, pair = name == coded.flight.transmitter, f"{coded.flight.transmitter}-{name}"
+    time_s = seconds_since(captured.raw.time.values, captured.raw.time.values[0])
     counted = triggers(time_s, prf_hz=sent.waveform.prf_hz)
-    present = [channel for channel in _CHANNELS if channel in recording.channels]
-    every = np.arange(len(time_s))
-    read = captured.reader(present if is_transmitter else list(_CHANNELS), every)
-    channels, saturation = _channels(read, present, captured, len(every))
+    present = [channel for channel in _CHANNELS if channel in captured.raw.attrs["channels"]]
+    every, recorded = np.arange(len(time_s)), present if is_transmitter else list(_CHANNELS)
+    channels, saturation = _channels(captured.reader(recorded, every), present, captured, len(every))
     flags = [channel.flags for channel in channels] + [saturation.flags]
-    pair = f"{campaign.flight(flight).transmitter}-{name}"
-    frames = captured.frames.numbers
-    demodulator = Demodulator(
-        lambda pulses: sent.inverses.at(frames[pulses]), captured.numerology, sent.waveform.capture_samples
-    )
-    if _is_inverted(read, demodulator, "radar" if is_transmitter else "sidelink", len(every)):
-        read = _conjugated(read)
+    try:
+        code = coded.code(name)
+    except CampaignError as error:
+        symbols = f"not decided: {error.found}"
+        flags.append({"symbols_unsure": f"{name}: {symbols}"})
+        nothing = (None, None, None, None, None)
+        return BenchNode(name, counted, channels, saturation.shares, *nothing, symbols, Flags.merged(*flags))
+    if code.captured.order != captured.order:
         line = (
             f"{name}: the code matches the complex conjugate of the samples; change nodes.{name}.iq, or waveform.iq "
             "if all nodes are affected"
         )
         flags.append({"spectrum_inverted": line})
-    before, clock, contact, state = None, None, None, None
+    before, clock, contact, state, link, method = None, None, None, None, None, str(processing.sidelink)
+    if code.decided is not None:
+        method, known = code.decided.sidelink_method(method), np.isin(every, code.used)
+        raised = code.decided.symbols.flags(known[code.decided.rows >= 0])
+        flags.append({key: f"{name}: {line}" for key, line in raised.items()})
     measured: Transfer | None = None
+    used, time_s = code.used, time_s[code.used]
     if is_transmitter:
-        measured = transfer_by_code(read, demodulator, time_s=time_s)
+        measured = transfer_by_code(*code.part(["radar"], used), time_s=time_s)
     else:
-        contact = measure_contact(f"{name} sidelink", _by_code(read, demodulator, "sidelink"), len(every))
+        contact = measure_contact(f"{name} sidelink", code.transfer("sidelink", every), len(every))
         flags.append(contact.flags if contact else {})
-        clock, flags_of_clock = _clock(read, sent, name, len(every))
+        clock, flags_of_clock = _clock(code.captured.reader(["sidelink"], every), sent, name, len(every))
         flags.append(flags_of_clock)
-        by_code = _by_code(read, demodulator, "radar")
-        uncorrected = measure_link(pair, by_code, time_s, captured.numerology, divided=False)
-        before = uncorrected.coherence if uncorrected else None
+        if sent.unknown is None or sent.unknown.unambiguous:
+            uncorrected = measure_link(pair, code.transfer("radar", used), time_s, captured.numerology, divided=False)
+            before = uncorrected.coherence if uncorrected else None
         try:
             measured = transfer_by_sidelink(
-                read, demodulator,
-                sidelink_m=np.zeros(len(every)), method=campaign.settings.processing.sidelink,
-                accuracy_db=strictest_accuracy_db(campaign.settings.processing.accuracy_db), where=where,
+                *code.part(_CHANNELS, used), sidelink_m=np.zeros(len(used)), method=method,
+                accuracy_db=coded.accuracy_db, where=captured.recording,
             )  # fmt: skip
         except CampaignError as error:
             flags.append({"sidelink_lost": f"{name}: {error.found}"})
         else:
             state = measured.report["sidelink"]
-    link = None
     if measured is not None:
         # the radar is stationary: the flags of echo processing that assume a flight do not apply
         flags.append({key: line for key, line in measured.flags.items() if key not in _OF_FLIGHTS})
@@ -484,11 +601,11 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_t
             rows = measured.form
             link = measure_link(
                 pair, lambda pulses: rows(kept[pulses]), time_s[kept], captured.numerology, divided=not is_transmitter,
-                prefix_cells=captured.numerology.delay_cells if is_transmitter else None,
+                prefix_cells=captured.numerology.delay_cells if is_transmitter else None, noise_gain=code.noise_gain,
             )  # fmt: skip
             flags.append(link.flags if link else {"link_weak": f"{pair}: no path above the noise"})
     return BenchNode(
-        name, counted, channels, saturation.shares, clock, state, contact, link, before,
+        name, counted, channels, saturation.shares, clock, state, contact, link, before, code.symbols,
         Flags.merged(*flags),
     )  # fmt: skip
 
@@ -510,31 +627,6 @@ def _channels(
             yield iq
 
     return tuple(measure_channel(name, blocks(name), captured.numerology) for name in present), saturation
-
-
-def _by_code(read: Read, demodulator: Demodulator, channel: str) -> Any:
-    """Return a function that computes the transfer functions of a channel from the code, without a sidelink."""
-
-    def form(pulses: Pulses) -> Complexes:
-        return demodulator.symbols(read(pulses)[channel], pulses, channel=channel)
-
-    return form
-
-
-def _conjugated(read: Read) -> Read:
-    return lambda pulses: {name: conjugates(iq) for name, iq in read(pulses).items()}
-
-
-def _is_inverted(read: Read, demodulator: Demodulator, channel: str, count: int) -> bool:
-    """Return True if the code matches the complex conjugate of a channel's samples, but not the samples themselves."""
-    pulses = np.concatenate(spread(count, groups=4, each=16))
-
-    def locks(reader: Read) -> bool:
-        by_code = _by_code(reader, demodulator, channel)
-        contact = measure_contact(channel, lambda rows: by_code(pulses[rows]), len(pulses))
-        return contact is not None and 2 * contact.dropouts < contact.pulses
-
-    return not locks(read) and locks(_conjugated(read))
 
 
 def _clock(read: Read, sent: Transmitted, name: str, count: int) -> tuple[ClockOffset | None, dict[str, str]]:

@@ -20,7 +20,7 @@ from apertura.tools.bench.measurement import Bench, measure_bench, series
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, page
 from apertura.views.report.sheet import BLUE, GREEN, ORANGE, RED, SKY, sheet, thinned
 from apertura.workflow.lineage import result_of
-from apertura.workflow.stale import stale_results
+from apertura.workflow.stale import outdated_places
 
 REPORT, PAGE, PICTURE = "bench.json", "bench.html", "bench.png"
 _COLOURS = (BLUE, ORANGE, GREEN, RED, SKY)
@@ -64,12 +64,11 @@ def print_bench(campaign: Campaign, *, write: bool = False) -> int:
             expected="a line with the columns flight, bench, transmitter, nodes for a recording of a stationary radar",
             remedy="Add the line; no flight log is required.",
         )
-    stale, flagged = set(stale_results(campaign)), 0
+    for where in outdated_places(campaign, "bench"):
+        bench(campaign, *where)
+    flagged = 0
     for flight in flights:
-        manifest = campaign.manifest("bench", flight)
-        if manifest in stale or not (campaign.root / manifest).is_file():
-            bench(campaign, flight)
-        report = open_listed(campaign.result(flight, REPORT), campaign.root / manifest)
+        report = open_listed(campaign.result(flight, REPORT), campaign.root / campaign.manifest("bench", flight))
         _print(flight, report)
         for name in (PAGE, PICTURE):
             print(f"  {campaign.relative(campaign.result(flight, name))}")

@@ -107,8 +107,10 @@ class Preview:
                 self.nodes[flight.name, node] = NodeSoFar(campaign, flight.name, node, sent, follow=follow)
             for pair in flight.pairs:
                 tx, rx = (self.nodes[flight.name, node] for node in pair.split("-"))
+                decided_by = campaign.symbol_source(flight.name, pair)
+                source = None if decided_by in {None, rx.name} else self.nodes[flight.name, str(decided_by)]
                 self.pairs.append(
-                    PairSoFar(campaign, flight.name, pair, self._scene, None, tx, rx, sent, threads, plans)
+                    PairSoFar(campaign, flight.name, pair, self._scene, None, tx, rx, sent, threads, plans, source)
                 )
 
     def _scene(self, block: PulseBlock) -> tuple[SceneGrid, ConfiguredGround]:
@@ -149,7 +151,7 @@ class Preview:
             print(f"{datetime.now(UTC):%H:%M:%S}  {node.restart}", flush=True)
             node.restart = ""
             for number, pair in enumerate(self.pairs):
-                if node in (pair.tx, pair.rx):
+                if node in pair.nodes:
                     self._map.drop(pair)
                     self._picture(pair).unlink(missing_ok=True)
                     self.pairs[number] = pair.reset()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.campaign.config import CONFIG
 from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.common.units import nanoseconds, seconds_since
 from apertura.core.antenna.beam import Beams
@@ -346,6 +346,8 @@ class PairSoFar:
         Number of tiles formed in parallel.
     plans
         As in `ImageSoFar`.
+    source
+        Node whose sidelink gives unknown symbols; None if the symbols are known, or given by the receiver itself.
     images
         Coarse and fine image; blocks for the fine image are queued.
     taken
@@ -368,6 +370,7 @@ class PairSoFar:
     sent: Transmitted | None = None
     threads: int = 1
     plans: dict[int, Plan] = field(default_factory=dict)
+    source: NodeSoFar | None = None
     images: list[ImageSoFar] = field(default_factory=list)
     taken: int = 0
     dropped: int = 0
@@ -381,24 +384,24 @@ class PairSoFar:
 
     def reset(self) -> "PairSoFar":
         """Return the pair in its state before the first pulse."""
-        parameters = ("campaign", "flight", "name", "scene", "echo", "tx", "rx", "sent", "threads", "plans")
+        parameters = ("campaign", "flight", "name", "scene", "echo", "tx", "rx", "sent", "threads", "plans", "source")
         return PairSoFar(*(getattr(self, name) for name in parameters))
 
     def ready(self, *, ended: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return indices of associated transmitter and receiver captures that are ready and not processed yet.
+        """Return indices of associated captures that are ready and not processed yet: of `tx`, and of `heard_by`.
 
         Captures beyond the end of a log, or whose counterpart may still be recorded, are not ready.
         """
         nothing = np.zeros(0, np.int64)
-        if self.tx is None or self.rx is None or self.sent is None:
+        if self.tx is None or self.heard_by is None or self.sent is None:
             index = np.arange(self.taken, len(self.time))
             return index, index
-        until = min(node.known_until(ended=ended) for node in (self.tx, self.rx))
+        until = min(node.known_until(ended=ended) for node in self.nodes)
         last = int(np.searchsorted(self.tx.time, until, "right"))
-        if self.tx is self.rx:
+        if self.tx is self.heard_by:
             index = np.arange(self.taken, last)
             return index, index
-        tags = [nanoseconds(node.time) for node in (self.tx, self.rx)]
+        tags = [nanoseconds(node.time) for node in (self.tx, self.heard_by)]
         if last <= self.taken or not tags[1].size:
             return nothing, nothing
         interval_ns = round(1e9 / self.sent.waveform.prf_hz)
@@ -417,7 +420,7 @@ class PairSoFar:
             tags[1][rx_part],
             repetition_interval_s=interval_ns * 1e-9,
             tx_frame=self.tx.frame[tx_part],
-            rx_frame=self.rx.frame[rx_part],
+            rx_frame=self.heard_by.frame[rx_part],
             where=f"flight {self.flight}, pair {self.name}",
         )
         tx_index, rx_index = association.tx_index + tx_part.start, association.rx_index + rx_part.start
@@ -468,21 +471,22 @@ class PairSoFar:
     def _block(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64]) -> PulseBlock | None:
         """Return the echo of the given captures, computed as in step `echo`; None if no pulse is usable."""
         campaign, processing = self.campaign, self.campaign.settings.processing
-        if self.tx is None or self.rx is None or self.sent is None:
+        if self.tx is None or self.heard_by is None or self.sent is None:
             return self._read(cast("PairEcho", self.echo), tx_index)
         try:
             inside = inside_segments(campaign, self.flight, self.name, self.tx.time[tx_index])
         except CampaignError:  # all pulses are outside the segments
             return None
         tx = self.tx.acquisition(tx_index[inside])
-        rx = tx if self.rx is self.tx else self.rx.acquisition(rx_index[inside])
+        heard = tx if self.heard_by is self.tx else self.heard_by.acquisition(rx_index[inside])
+        rx = heard if self.source is None else tx
         hovers = bool(campaign.segments_of(self.flight, self.name))
         if not place(tx, rx, tx.raw.time.values, hovers=hovers).good.any():
             self.drop_reason = "hover: platform stationary"
             return None
         air = scene_air(campaign, tx.track.position.values)
         offset = calibrated(campaign, self.flight, self.name)
-        echo = pair_echo(tx, rx, self.sent, processing, offset, air, hovers=hovers)
+        echo = pair_echo(tx, rx, self.sent, processing, offset, air, hovers=hovers, source=heard)
         return self._read(echo, np.arange(echo.dataset.sizes["pulse"]))
 
     def _read(self, echo: PairEcho, pulses: NDArray[np.int64]) -> PulseBlock:
@@ -532,6 +536,16 @@ class PairSoFar:
         return judged
 
     @property
+    def nodes(self) -> list[NodeSoFar]:
+        """Nodes whose recordings give the pulses; empty for a recorder that stores transfer functions."""
+        return [node for node in (self.tx, self.rx, self.source) if node is not None]
+
+    @property
+    def heard_by(self) -> NodeSoFar | None:
+        """Node whose captures are associated with those of the transmitter: the source of symbols, or the receiver."""
+        return self.source or self.rx
+
+    @property
     def time(self) -> Times:
         """(pulse,) datetime64[ns], UTC: transmission times of the pulses so far."""
         if self.tx is None:
@@ -558,8 +572,12 @@ class PairSoFar:
     @property
     def waits(self) -> str:
         """Reason for missing pulses; empty: none."""
-        nodes = [node.waits for node in (self.tx, self.rx) if node is not None]
-        return next((reason for reason in (*nodes, self.drop_reason) if reason), "")
+        symbols = ""
+        if self.source is not None and not self.images:
+            count = number_of(len(self.source.time), "capture")
+            symbols = f"symbols are decided from the sidelink of {self.source.name}, which has recorded {count}"
+        reasons = (*(node.waits for node in self.nodes), self.drop_reason, symbols)
+        return next((reason for reason in reasons if reason), "")
 
     @property
     def shown(self) -> ImageSoFar | None:

@@ -20,10 +20,12 @@ from apertura.views.quality import (
     BUDGET,
     DECISIONS,
     FLAGGED,
+    PAYLOAD,
     VERDICTS,
     budget_rows,
     decision_rows,
     flag_rows,
+    payload_row,
     read_report,
     sentences,
     shared_rows,
@@ -33,6 +35,7 @@ from apertura.views.report import PAGE, PICTURES, SUM_PICTURES
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, rst_table, rst_text
 from apertura.views.report.page import page as page_of
 from apertura.workflow.lineage import result_of
+from apertura.workflow.rule_inputs import JobScope, Scope, has_frames
 from apertura.workflow.rules import STACK
 
 SETTING_COLUMNS = ("key", "value")
@@ -64,6 +67,13 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
         yield from _pictures(campaign.result(flight, FUSED), {f"{name}.png": "pictures" for name in SUM_PICTURES})
     for pair in campaign.flight(flight).pairs:
         yield from _pair_blocks(campaign, flight, pair, reports[pair])
+    if has_frames(JobScope(campaign, Scope.FLIGHT, (flight,))):
+        folder = campaign.result(flight, "payload")
+        report = open_listed(folder / "payload.json", folder / "payload.manifest.json")
+        yield Heading(2, "Payload")
+        yield from _pictures(folder, {"payload.png": "payload"})
+        caption = "Frames of each node. SER: symbol error rate expected from the SNR; FER: frame error rate."
+        yield Table(caption, PAYLOAD, [payload_row(summary) for summary in report["nodes"]])
     raised = flag_rows(reports)
     if campaign.settings.stack and flight in campaign.settings.stack.flights:
         folder = campaign.result(STACK, flight)
