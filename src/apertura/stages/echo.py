@@ -115,7 +115,7 @@ def pair_echo(
     if sent.unknown is None:
         frames = tx.frames.numbers[pulses.tx_index[paired]]
         frames, displaced = _placed((tx, rx), pulses.rx_index[paired], frames, sent)
-        decided, basis = dict[str, Any](), tx.frames.basis
+        decided, basis, channels = dict[str, Any](), tx.frames.basis, dict[str, Any]()
     else:
         decision = PairSymbols.of((tx, rx), source or rx, sent, pulses, paired, processing.accuracy_db)
         usable = decision.usable()
@@ -124,7 +124,7 @@ def pair_echo(
             {"decided": decision.report(usable)},
             Flags(decision.symbols.flags(usable[decision.rows >= 0])),
         )
-        basis = f"captures of {decision.source}"
+        basis, channels = f"captures of {decision.source}", decision.variables
         if processing.sidelink == "auto":
             processing = processing.model_copy(
                 update={"sidelink": "divide" if decision.symbols.divides else "least_noise"}
@@ -164,6 +164,7 @@ def pair_echo(
             "path_limit": ("pulse", air_on_track.wave_speed_m_s * (sent.waveform.longest_delay_s - extra_delay_s)),
             **_sidelink(measured),
             **geometry,
+            **channels,
         },
         attrs=_attributes((tx, rx), pulses, positions, measured, repeats, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m, **stated_air(air_on_track)},

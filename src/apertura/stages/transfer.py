@@ -116,7 +116,7 @@ class PairEcho:
             rx = open_acquisition(campaign, flight, name, sent)
             if source is not None:
                 node = rx if source == name else open_acquisition(campaign, flight, source, sent)
-                sent = with_symbols(sent, node, decided_symbols(node, sent, processing.accuracy_db))
+                sent = with_symbols(sent, node, decided_symbols(node, sent, processing.accuracy_db, stage))
             return rx, sent, processing
 
         return cls.formed(stage, receiver)
