@@ -275,9 +275,18 @@ def test_plan_and_budget_state_the_loss_of_symbols_before_and_after_the_echo(tmp
         assert stated == []
         return
     assert decisions[0].value == "reciprocal"
-    assert decisions[0].reason.endswith("when they are formed; SNR loss 4.29 dB")
+    power, window = np.abs(np.load(root / "raw" / "codes.npy")) ** 2, np.hanning(1024)
+    gain = power.mean() * (window**2 / power).mean() / np.mean(window**2)
+    reason, stated_db = decisions[0].reason.removesuffix(" dB").split("; SNR loss ")
+    assert reason.endswith("when they are formed")
+    assert float(stated_db) == pytest.approx(10 * np.log10(gain), abs=0.1)
     assert decisions[1].value == "wiener"
-    assert float(decisions[1].reason.split("SNR loss ")[1].removesuffix(" dB")) < 1
+    measured_db = decisions[1].reason.split("SNR loss ")[1]
+    assert float(measured_db.removesuffix(" dB")) < 1
+    # of the same echo with equal weights
+    edit_config(root, lambda document: document.update(processing={"window": "none"}))
+    unweighted = {item.name: item for item in expected_plan(Campaign.load(root), "f01", "uav1-uav1").decisions}
+    assert unweighted["symbol_filter"].reason.split("SNR loss ")[1] != measured_db
     assert stated[0].startswith("wiener filter: SNR loss 0.")
 
 

@@ -61,6 +61,24 @@ def test_wiener_filter_has_the_smallest_loss_and_its_closed_form(name):
         assert np.mean(wiener.weight(power)) == pytest.approx(1, abs=1e-6)
 
 
+@pytest.mark.parametrize("window", [np.hanning(SUBCARRIERS), np.ones(SUBCARRIERS)], ids=["hann", "none"])
+@pytest.mark.parametrize("item", FILTERS)
+def test_window_weights_the_noise_gain_and_the_peak_of_a_fixed_code(window, item):
+    """Subcarrier n has the share u²/Σu² of the noise of a profile, and the share u/Σu of the peak of a point."""
+    rng = np.random.default_rng(6)
+    edges = np.abs(np.linspace(-1, 1, SUBCARRIERS)) > 0.6
+    codes = np.where(edges, 1.9, 0.7) * drawn(rng, "16qam", 1)  # weak symbols in mid-band
+    power = np.abs(codes.astype(complex)) ** 2
+    chosen = choose_filter(power, requested=item, snr=0.3, frames=1, tolerated_db=0.0, window=window).filter
+    profile = np.fft.fft(window * filtered(white(rng, 2000), np.tile(codes, (2000, 1)), chosen), axis=1, norm="ortho")
+    flat = power.mean() * np.mean(np.abs(profile) ** 2) / np.mean(window**2)
+    assert decibels(flat) == pytest.approx(decibels(chosen.noise_gain(power, window)), abs=0.05)
+    assert np.sum(window * chosen.weight(power)) / window.sum() == pytest.approx(1, abs=1e-6)
+    sidelobes = np.abs(np.fft.fft(window * (chosen.weight(power[0]) - 1))) ** 2 / window.sum() ** 2
+    expected = data_sidelobes(chosen.self_noise(power, window), window, 1)
+    assert np.mean(sidelobes) == pytest.approx(expected, rel=1e-6, abs=1e-20)
+
+
 @pytest.mark.parametrize("name", QAM)
 @pytest.mark.parametrize("item", FILTERS)
 def test_noise_of_a_profile_is_multiplied_by_the_noise_gain(name, item):
@@ -87,7 +105,7 @@ def test_data_sidelobes_of_a_point_have_their_predicted_level(name, item, snr, f
         total = filtered(codes.astype(np.complex64), codes, chosen).sum(axis=0)
         profile = np.abs(np.fft.fft(total * window)) ** 2 / (pulses * window.sum()) ** 2
         level.append(profile[20:-20].mean())
-    expected = data_sidelobes(SymbolFilter.of(item, powers(name), snr).self_noise(powers(name)), SUBCARRIERS, frames)
+    expected = data_sidelobes(SymbolFilter.of(item, powers(name), snr).self_noise(powers(name)), window, frames)
     assert decibels(np.mean(level)) == pytest.approx(decibels(expected), abs=0.1)
 
 
@@ -121,15 +139,16 @@ def test_snr_of_echoes_is_measured_behind_the_division(name, snr_db):
     codes = drawn(rng, name, 1000)
     echo = np.exp(-2j * np.pi * np.arange(SUBCARRIERS) * 17.4 / SUBCARRIERS) * 10 ** (snr_db / 20)
     received = codes * echo + white(rng, 1000)
-    gain = SymbolFilter().noise_gain(powers(name))
-    measured = echo_snr((received / codes).astype(np.complex64), gain)
-    assert measured == pytest.approx(10 ** (snr_db / 10), rel=0.1, abs=0.005 * gain)
+    power = np.abs(codes.astype(complex)) ** 2
+    measured = echo_snr((received / codes).astype(np.complex64), power)
+    assert measured == pytest.approx(10 ** (snr_db / 10), rel=0.1, abs=0.005 * SymbolFilter().noise_gain(power))
 
 
 def test_choice_needs_tolerated_sidelobes_and_keeps_the_requested_filter():
     power = np.tile(powers("64qam"), (4, 8))
+    settings = {"tolerated_db": -50.0, "window": np.hanning(SUBCARRIERS)}
     chosen = {
-        (snr, frames): choose_filter(power, requested="auto", snr=snr, frames=frames, tolerated_db=-50.0).filter.name
+        (snr, frames): choose_filter(power, requested="auto", snr=snr, frames=frames, **settings).filter.name
         for snr in (0.01, np.inf)
         for frames in (1, 1000)
     }
@@ -139,9 +158,9 @@ def test_choice_needs_tolerated_sidelobes_and_keeps_the_requested_filter():
         (np.inf, 1): "reciprocal",
         (np.inf, 1000): "reciprocal",
     }
-    lossy = choose_filter(power, requested="reciprocal", snr=0.01, frames=1000, tolerated_db=-50.0)
+    lossy = choose_filter(power, requested="reciprocal", snr=0.01, frames=1000, **settings)
     assert lossy.flags == {"symbols_noise": "SNR loss of the reciprocal filter 4.3 dB, smallest loss 0.0 dB"}
-    loud = choose_filter(power, requested="matched", snr=0.01, frames=1, tolerated_db=-50.0)
+    loud = choose_filter(power, requested="matched", snr=0.01, frames=1, **settings)
     assert loud.flags["symbols_sidelobes"].startswith("data sidelobes of -29.5 dB after the matched filter, in 1 ")
     assert filter_of(loud.report) == loud.filter
     assert filter_of({}) == filter_of(None) == SymbolFilter()

@@ -22,12 +22,12 @@ from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
 from apertura.core.echo.captures import runs, sampled_pulses, spread
+from apertura.core.echo.compression import window_weights
 from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.frame_codes import displacement
 from apertura.core.echo.interference import Interference
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
-from apertura.core.echo.symbol_filter import tolerated_sidelobes_db
 from apertura.core.echo.transfer import (
     Transfer,
     as_complex,
@@ -261,8 +261,8 @@ def _transfer(
     """
     (tx, rx), (index, frames) = nodes, captures
     accuracy_db = strictest_accuracy_db(processing.accuracy_db)
-    tolerated_db = tolerated_sidelobes_db(processing.accuracy_db)
-    choose = sent.filter_choice(processing.symbol_filter, frames=frames, tolerated_db=tolerated_db)
+    # a later change of the window does not change the echo: the choice is that of a Hann window
+    choose = sent.filter_choice(processing, frames, window_weights("hann", len(rx.numerology.frequency_hz)))
     sent_ns = nanoseconds(at)
     time_s = (sent_ns - sent_ns[0]) * 1e-9
     if tx.name == rx.name:
