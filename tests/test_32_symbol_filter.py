@@ -5,7 +5,9 @@ import pytest
 
 from apertura.core.echo.constellation import constellation
 from apertura.core.echo.frame_codes import Inverses
-from apertura.core.echo.interference import PulsedInterference
+from apertura.core.echo.interference import PulsedInterference, limited
+from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, fit_line_of_sight
+from apertura.core.echo.sidelink import METHODS
 from apertura.core.echo.symbol_filter import FILTERS, SymbolFilter, choose_filter, data_sidelobes, echo_snr, filter_of
 
 QAM = ("16qam", "64qam", "256qam")
@@ -163,7 +165,7 @@ def test_choice_needs_tolerated_sidelobes_and_keeps_the_requested_filter():
     loud = choose_filter(power, requested="matched", snr=0.01, frames=1, **settings)
     assert loud.flags["symbols_sidelobes"].startswith("data sidelobes of -29.5 dB after the matched filter, in 1 ")
     assert filter_of(loud.report) == loud.filter
-    assert filter_of({}) == filter_of(None) == SymbolFilter()
+    assert filter_of({}) is None
 
 
 @pytest.mark.parametrize("name", QAM)
@@ -179,3 +181,82 @@ def test_weak_symbols_are_not_taken_for_pulsed_interference(name):
     transfer[::10, 20:22] += 10 ** (45 / 20)
     found = PulsedInterference.measured([transfer], frequency, equal, noise_peak=peak)
     assert found.hits(transfer[::10])[:, 20:22].all()
+
+
+# ---- Sidelink with symbols of varying modulus
+
+
+def sidelink_of(rng, name, snr_db, frames=400):
+    """Return codes, weights, and a sidelink with random delays and phases, divided by the codes."""
+    number = np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2
+    codes = drawn(rng, name, frames)
+    delay, phase = rng.uniform(-9, 9, (frames, 1)), rng.uniform(-np.pi, np.pi, (frames, 1))
+    common = np.exp(1j * phase - 2j * np.pi * number * delay / SUBCARRIERS)
+    received = codes * common + white(rng, frames) * 10 ** (-snr_db / 20)
+    power = np.abs(codes) ** 2
+    weight = (power / power.mean(axis=1, keepdims=True)).astype(np.float32)
+    return codes, weight, common, (received / codes).astype(np.complex64)
+
+
+@pytest.mark.parametrize("name", QAM)
+@pytest.mark.parametrize(("method", "cells"), [("two_parameter", 1), ("gated", 33)])
+def test_weighted_sidelink_has_the_noise_of_a_constant_modulus(name, method, cells):
+    """Residual noise is K/(Nρ) with weights |c|², and P·E[1/|c|²] times as large with equal weights."""
+    rng, snr_db = np.random.default_rng(7), 15.0
+    _, weight, common, sidelink = sidelink_of(rng, name, snr_db, frames=4000)
+    noise = []
+    for of in (weight, None):
+        corrected = METHODS[method](common.astype(np.complex64), sidelink, None, of)
+        noise.append(np.mean(np.abs(corrected - corrected.mean()) ** 2))
+    expected, gain = cells / (SUBCARRIERS * 10 ** (snr_db / 10)), SymbolFilter().noise_gain(powers(name))
+    matched = SymbolFilter.of("matched", powers(name), 1.0).self_noise(powers(name))
+    left = (gain - 1) * matched * cells / SUBCARRIERS  # by one step towards the weighted least squares
+    assert decibels(noise[0] / expected) == pytest.approx(decibels(1 + left), abs=0.25)
+    assert decibels(noise[1] / expected) == pytest.approx(decibels(gain), abs=0.25)
+
+
+def test_weights_lock_the_sidelink_at_the_snr_of_a_constant_modulus():
+    """At Nρ = 14 dB, 64-QAM locks in as many pulses as QPSK, and no more often in noise alone."""
+    rng, level_db = np.random.default_rng(8), 14 - decibels(SUBCARRIERS)
+    rates = {}
+    for name in ("qpsk", "64qam"):
+        _, weight, _, sidelink = sidelink_of(rng, name, level_db, frames=1500)
+        rates[name] = fit_line_of_sight(sidelink, weight).locked.mean()
+    assert rates["64qam"] == pytest.approx(rates["qpsk"], abs=0.04)
+    assert fit_line_of_sight(sidelink).locked.mean() < rates["qpsk"] - 0.3
+    codes = drawn(rng, "64qam", 4000)
+    power = np.abs(codes) ** 2
+    noise = (white(rng, 4000) / codes).astype(np.complex64)
+    locks = fit_line_of_sight(noise, (power / power.mean(axis=1, keepdims=True)).astype(np.float32)).locked.sum()
+    assert locks <= 4000 * LOCK_FALSE_ALARM + 4 * np.sqrt(4000 * LOCK_FALSE_ALARM)
+
+
+def test_weak_symbols_of_a_sidelink_are_not_taken_for_interference():
+    """Noise of 0 dB divided by 64-QAM; a burst of 40 dB is limited with the weights, too."""
+    _, weight, _, sidelink = sidelink_of(np.random.default_rng(9), "64qam", 0.0)
+    assert limited(sidelink)[1].any(axis=1).mean() > 0.9
+    assert limited(sidelink, weight)[1].mean() < 1e-5
+    sidelink[:, 20] += 100 / np.sqrt(weight[:, 20])
+    assert limited(sidelink, weight)[1][:, 20].all()
+
+
+@pytest.mark.parametrize("name", QAM)
+@pytest.mark.parametrize("item", ["reciprocal", "wiener"])
+@pytest.mark.parametrize("snr_db", [-5.0, 15.0])
+@pytest.mark.parametrize("sidelink_db", [12.0, 25.0])
+def test_loss_of_division_by_a_sidelink_equals_the_closed_form(name, item, snr_db, sidelink_db):
+    """Floor of a profile relative to its peak, relative to the same floor with QPSK, within 0.1 dB (eqs. 10, 11)."""
+    rng, frames = np.random.default_rng(10), 1500
+    snr, divided_snr = 10 ** (snr_db / 10), 10 ** (sidelink_db / 10)
+    floors = []
+    for of in (name, "qpsk"):
+        codes, weight, common, sidelink = sidelink_of(rng, of, sidelink_db, frames)
+        chosen = SymbolFilter.of(item if of == name else "reciprocal", powers(of), 1 / (1 / snr + 1 / divided_snr))
+        radar = filtered(codes * common + white(rng, frames) / np.sqrt(snr), codes, chosen)
+        path = fit_line_of_sight(sidelink, weight)
+        corrected = METHODS["divide"](radar.astype(np.complex64), sidelink, path)
+        profile = np.abs(np.fft.fft(corrected, axis=1)) ** 2
+        floors.append(profile[:, 1:].mean() / np.abs(corrected.mean()) ** 2)
+    chosen = SymbolFilter.of(item, powers(name), 1 / (1 / snr + 1 / divided_snr))
+    predicted = chosen.loss(powers(name), snr, None, divided_snr)
+    assert decibels(floors[0] / floors[1]) == pytest.approx(decibels(predicted), abs=0.1)

@@ -140,10 +140,14 @@ def symbols_of(campaign: Campaign, pair: OpenPair) -> Mapping[str, Any]:
     sent = transmitted(campaign, waveform)
     if not pair.report:
         choose = sent.filter_choice(campaign.settings.processing, np.arange(len(pair.time_s)), pair.weight)
-        return choose(None).report if choose else {}
-    if sent.power is not None:  # with the window of the image, which may exclude subcarriers
-        snr = 0.0 if symbols["snr_db"] is None else 10 ** (symbols["snr_db"] / 10)
-        symbols["loss_db"] = round(decibels(filter_of(symbols).loss(sent.power, snr, pair.weight)), 2)
+        return choose(None, np.inf).report if choose else {}
+    chosen = filter_of(symbols)
+    if chosen is not None and sent.power is not None:  # with the window of the image, which may exclude subcarriers
+        snr, divided_snr = (
+            otherwise if symbols[name] is None else 10 ** (symbols[name] / 10)
+            for name, otherwise in (("snr_db", 0.0), ("divided_snr_db", np.inf))
+        )
+        symbols["loss_db"] = round(decibels(chosen.loss(sent.power, snr, pair.weight, divided_snr)), 2)
     return symbols
 
 

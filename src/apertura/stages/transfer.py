@@ -134,7 +134,7 @@ class PairEcho:
             frames = np.zeros(len(rx.raw.start), np.int64)
             frames[dataset.capture.values] = dataset.frame.values
             demodulator = demodulator_of(rx, sent, processing, frames)
-            demodulator = replace(demodulator, filter=filter_of(dataset.attrs.get("symbols")))
+            demodulator = replace(demodulator, filter=filter_of(dataset.attrs.get("symbols", {})))
             tones.update(demodulator.tones)
             for channel in tones.values():
                 channel.lines = tuple(dataset.attrs.get("tone_lines", ()))

@@ -111,9 +111,10 @@ class Transmitted:
 
     def filter_choice(
         self, processing: Processing, frames: NDArray[np.int64], window: Floats
-    ) -> Callable[[Complexes | None], FilterChoice] | None:
+    ) -> Callable[[Complexes | None, float], FilterChoice] | None:
         """Return the choice of the filter from a sample of transfer functions, None before they are measured.
 
+        Its second argument is the SNR of a sidelink by which they are divided, as of `SymbolFilter.loss`.
         For symbols of constant modulus, there is no choice, and None is returned.
 
         Parameters
@@ -129,7 +130,7 @@ class Transmitted:
             return None
         power, different = self.power, len(np.unique(frames % self.inverses.count))
 
-        def choose(sample: Complexes | None) -> FilterChoice:
+        def choose(sample: Complexes | None, divided_snr: float) -> FilterChoice:
             return choose_filter(
                 power,
                 requested=processing.symbol_filter,
@@ -137,6 +138,7 @@ class Transmitted:
                 frames=different,
                 tolerated_db=tolerated_sidelobes_db(processing.accuracy_db),
                 window=window,
+                divided_snr=divided_snr,
             )
 
         return choose

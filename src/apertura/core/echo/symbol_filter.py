@@ -17,6 +17,7 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
+from apertura.core.echo.sidelink_state import NULL_DB
 
 FilterName = Literal["reciprocal", "matched", "wiener"]
 
@@ -97,9 +98,38 @@ class SymbolFilter:
         """Return the variance κ of the echo amplitude over the data (eq. 5); arguments as `of`."""
         return _mean((self.weight(power) - 1) ** 2, window, order=2)
 
-    def loss(self, power: Powers, snr: float, window: Floats | None = None) -> float:
-        """Return the noise floor with data relative to that of a constant modulus, L = G + κρ (eq. 7)."""
-        return self.noise_gain(power, window) + self.self_noise(power, window) * snr
+    def loss(self, power: Powers, snr: float, window: Floats | None = None, divided_snr: float = float("inf")) -> float:
+        """Return the noise floor with data relative to that of a constant modulus, both relative to the peak.
+
+        Parameters
+        ----------
+        power, snr, window
+            As of `of`.
+        divided_snr
+            SNR per subcarrier ρ_s of a sidelink by which the echoes are divided; infinite: they are not divided.
+
+        Notes
+        -----
+        Source: docs/theory/changing_codes.md, eq. 7, and eqs. 10 and 11 of echoes divided by a sidelink.
+        """
+        mean = float(power.mean())
+
+        def floor(power: Powers, weight: Powers) -> float:
+            first, second = _moments_of_inverse(divided_snr * power / mean)
+            peak = _mean(weight * first, window)
+            data = _mean(weight**2 * second - 2 * peak * weight * first, window, order=2) + peak**2
+            return (mean * _mean(weight**2 * second / power, window, order=2) + snr * data) / peak**2
+
+        return floor(power, self.weight(power)) / floor(np.full_like(power, mean), np.ones_like(power))
+
+
+def _moments_of_inverse(snr: Powers) -> tuple[Powers, Powers]:
+    """Return the mean of A/S and of |A/S|² for subcarriers of an SNR, with |S| limited to A/10 (eq. 11)."""
+    if np.isinf(snr).all():
+        return np.ones_like(snr), np.ones_like(snr)
+    x = np.minimum(snr, 50.0)
+    below = scipy.special.expi(x) - np.log(x) - np.euler_gamma + scipy.special.exp1(x * 10 ** (NULL_DB / 10)) + 0.5
+    return -np.expm1(-snr), np.where(snr < 50, x * np.exp(-x) * below, 1 + 1 / snr + 2 / snr**2)
 
 
 def _mean(values: Powers, window: Floats | None, order: int = 1) -> float:
@@ -162,7 +192,14 @@ class FilterChoice:
 
 
 def choose_filter(
-    power: Powers, *, requested: str, snr: float, frames: int, tolerated_db: float, window: Floats
+    power: Powers,
+    *,
+    requested: str,
+    snr: float,
+    frames: int,
+    tolerated_db: float,
+    window: Floats,
+    divided_snr: float = float("inf"),
 ) -> FilterChoice:
     """Choose the filter of the symbols by its predicted noise floor and data sidelobes.
 
@@ -180,10 +217,12 @@ def choose_filter(
         Tolerated level of data sidelobes relative to the peak, dB.
     window
         (subcarrier,) float64, window of the range compression.
+    divided_snr
+        As of `SymbolFilter.loss`.
 
     Notes
     -----
-    Source: docs/theory/changing_codes.md, eqs. 4 to 7.
+    Source: docs/theory/changing_codes.md, eqs. 4 to 7, 10 and 11.
 
     Examples
     --------
@@ -196,10 +235,11 @@ def choose_filter(
     reciprocal 2.76
     """
     power = np.asarray(power, np.float64)
-    filters = {name: SymbolFilter.of(name, power, snr, window) for name in FILTERS}
+    noise = 1 / max(snr, 1e-12) + 1 / divided_snr  # the filter reduces noise of both channels
+    filters = {name: SymbolFilter.of(name, power, 1 / noise if noise else np.inf, window) for name in FILTERS}
     sidelobes = {name: data_sidelobes(item.self_noise(power, window), window, frames) for name, item in filters.items()}
     known = np.isfinite(snr)
-    losses = {name: item.loss(power, snr if known else 0.0, window) for name, item in filters.items()}
+    losses = {name: item.loss(power, snr if known else 0.0, window, divided_snr) for name, item in filters.items()}
     summary = f"SNR {decibels(max(snr, 1e-9)):.1f} dB per subcarrier"
     if requested != "auto":
         name: FilterName = next(item for item in FILTERS if item == requested)
@@ -219,6 +259,7 @@ def choose_filter(
         "offset": chosen.offset,
         "slope": chosen.slope,
         "snr_db": round(decibels(snr), 2) if known and snr > 0 else None,
+        "divided_snr_db": round(decibels(divided_snr), 2) if np.isfinite(divided_snr) else None,
         "noise_gain_db": round(decibels(chosen.noise_gain(power, window)), 2),
         **({"noise_peak": chosen.noise_peak(power)} if frames > 1 else {}),
         "self_noise": round(chosen.self_noise(power, window), 4),
@@ -257,8 +298,8 @@ def data_sidelobes(self_noise: float, window: Floats, frames: int) -> float:
     return self_noise * float((window**2).sum() / window.sum() ** 2) / max(frames, 1)
 
 
-def filter_of(report: Mapping[str, Any] | None) -> SymbolFilter:
-    """Return the filter of a `FilterChoice.report`; the reciprocal one if the report names none."""
-    if not report or "filter" not in report:
-        return SymbolFilter()
+def filter_of(report: Mapping[str, Any]) -> SymbolFilter | None:
+    """Return the filter of a `FilterChoice.report`; None if the report names none."""
+    if "filter" not in report:
+        return None
     return SymbolFilter(report["filter"], report["scale"], report["offset"], report["slope"])
