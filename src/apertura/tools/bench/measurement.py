@@ -515,7 +515,7 @@ class _Coded:
         # read as configured, or else the complex conjugates
         orders = captured, replace(captured, order="conjugate" if captured.order == "complex" else "complex")
         if unknown is None:
-            codes = [_Code(one, self.sent, captured.frames.numbers, every) for one in orders]
+            code = _Code(captured, self.sent, captured.frames.numbers, every)
         else:
             if name == transmitter and not unknown.unambiguous:
                 raise ambiguous_symbols()
@@ -524,9 +524,9 @@ class _Coded:
                 return self._decided(orders, every)
             of_source = self.code(source)
             rows = rows_of(captured, of_source.captured, prf_hz=self.sent.waveform.prf_hz)
-            decided = replace(cast("PairSymbols", of_source.decided), rows=rows)
-            codes = [_Code.of(one, decided) for one in orders]
-        return codes[1] if not codes[0].locks(channel) and codes[1].locks(channel) else codes[0]
+            code = _Code.of(captured, replace(cast("PairSymbols", of_source.decided), rows=rows))
+        conjugate = replace(code, captured=orders[1])
+        return conjugate if not code.locks(channel) and conjugate.locks(channel) else code
 
     def _decided(self, orders: Sequence[Captured], every: Pulses) -> _Code:
         """Return the code in the sidelink of a node, of the order of I and Q in which the header has fewer errors."""
