@@ -71,7 +71,7 @@ def test_sidelink_state_does_not_depend_on_block_size():
     sidelink = (8 + rng.normal(size=(150, 128)) + 1j * rng.normal(size=(150, 128))).astype(np.complex64)
     in_one, in_many = (
         measure(sidelink),
-        measure_blocks(lambda: (sidelink[pulses] for pulses in blocks_of(np.arange(150), 31))),
+        measure_blocks(lambda: ((sidelink[pulses], None) for pulses in blocks_of(np.arange(150), 31))),
     )
     np.testing.assert_array_equal(in_many.locked, in_one.locked)
     np.testing.assert_allclose(in_many.delay_cells, in_one.delay_cells, atol=1e-6)
@@ -84,7 +84,7 @@ def test_wrong_code_is_detected_across_blocks():
     rng = np.random.default_rng(4)
     wrong_code = np.exp(2j * np.pi * rng.random(128))
     sidelink = (20 * wrong_code + rng.normal(size=(9, 128)) + 1j * rng.normal(size=(9, 128))).astype(np.complex64)
-    state = measure_blocks(lambda: (sidelink[pulses] for pulses in blocks_of(np.arange(9), 1)))
+    state = measure_blocks(lambda: ((sidelink[pulses], None) for pulses in blocks_of(np.arange(9), 1)))
     assert "wrong_code" in state.flags
     assert state.locked.all()
 

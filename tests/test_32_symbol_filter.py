@@ -5,7 +5,9 @@ import pytest
 
 from apertura.core.echo.constellation import constellation
 from apertura.core.echo.frame_codes import Inverses
-from apertura.core.echo.interference import PulsedInterference
+from apertura.core.echo.interference import PulsedInterference, limited
+from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, fit_line_of_sight
+from apertura.core.echo.sidelink import METHODS
 from apertura.core.echo.symbol_filter import FILTERS, SymbolFilter, choose_filter, data_sidelobes, echo_snr, filter_of
 
 QAM = ("16qam", "64qam", "256qam")
@@ -61,6 +63,24 @@ def test_wiener_filter_has_the_smallest_loss_and_its_closed_form(name):
         assert np.mean(wiener.weight(power)) == pytest.approx(1, abs=1e-6)
 
 
+@pytest.mark.parametrize("window", [np.hanning(SUBCARRIERS), np.ones(SUBCARRIERS)], ids=["hann", "none"])
+@pytest.mark.parametrize("item", FILTERS)
+def test_window_weights_the_noise_gain_and_the_peak_of_a_fixed_code(window, item):
+    """Subcarrier n has the share u²/Σu² of the noise of a profile, and the share u/Σu of the peak of a point."""
+    rng = np.random.default_rng(6)
+    edges = np.abs(np.linspace(-1, 1, SUBCARRIERS)) > 0.6
+    codes = np.where(edges, 1.9, 0.7) * drawn(rng, "16qam", 1)  # weak symbols in mid-band
+    power = np.abs(codes.astype(complex)) ** 2
+    chosen = choose_filter(power, requested=item, snr=0.3, frames=1, tolerated_db=0.0, window=window).filter
+    profile = np.fft.fft(window * filtered(white(rng, 2000), np.tile(codes, (2000, 1)), chosen), axis=1, norm="ortho")
+    flat = power.mean() * np.mean(np.abs(profile) ** 2) / np.mean(window**2)
+    assert decibels(flat) == pytest.approx(decibels(chosen.noise_gain(power, window)), abs=0.05)
+    assert np.sum(window * chosen.weight(power)) / window.sum() == pytest.approx(1, abs=1e-6)
+    sidelobes = np.abs(np.fft.fft(window * (chosen.weight(power[0]) - 1))) ** 2 / window.sum() ** 2
+    expected = data_sidelobes(chosen.self_noise(power, window), window, 1)
+    assert np.mean(sidelobes) == pytest.approx(expected, rel=1e-6, abs=1e-20)
+
+
 @pytest.mark.parametrize("name", QAM)
 @pytest.mark.parametrize("item", FILTERS)
 def test_noise_of_a_profile_is_multiplied_by_the_noise_gain(name, item):
@@ -87,7 +107,7 @@ def test_data_sidelobes_of_a_point_have_their_predicted_level(name, item, snr, f
         total = filtered(codes.astype(np.complex64), codes, chosen).sum(axis=0)
         profile = np.abs(np.fft.fft(total * window)) ** 2 / (pulses * window.sum()) ** 2
         level.append(profile[20:-20].mean())
-    expected = data_sidelobes(SymbolFilter.of(item, powers(name), snr).self_noise(powers(name)), SUBCARRIERS, frames)
+    expected = data_sidelobes(SymbolFilter.of(item, powers(name), snr).self_noise(powers(name)), window, frames)
     assert decibels(np.mean(level)) == pytest.approx(decibels(expected), abs=0.1)
 
 
@@ -121,15 +141,16 @@ def test_snr_of_echoes_is_measured_behind_the_division(name, snr_db):
     codes = drawn(rng, name, 1000)
     echo = np.exp(-2j * np.pi * np.arange(SUBCARRIERS) * 17.4 / SUBCARRIERS) * 10 ** (snr_db / 20)
     received = codes * echo + white(rng, 1000)
-    gain = SymbolFilter().noise_gain(powers(name))
-    measured = echo_snr((received / codes).astype(np.complex64), gain)
-    assert measured == pytest.approx(10 ** (snr_db / 10), rel=0.1, abs=0.005 * gain)
+    power = np.abs(codes.astype(complex)) ** 2
+    measured = echo_snr((received / codes).astype(np.complex64), power)
+    assert measured == pytest.approx(10 ** (snr_db / 10), rel=0.1, abs=0.005 * SymbolFilter().noise_gain(power))
 
 
 def test_choice_needs_tolerated_sidelobes_and_keeps_the_requested_filter():
     power = np.tile(powers("64qam"), (4, 8))
+    settings = {"tolerated_db": -50.0, "window": np.hanning(SUBCARRIERS)}
     chosen = {
-        (snr, frames): choose_filter(power, requested="auto", snr=snr, frames=frames, tolerated_db=-50.0).filter.name
+        (snr, frames): choose_filter(power, requested="auto", snr=snr, frames=frames, **settings).filter.name
         for snr in (0.01, np.inf)
         for frames in (1, 1000)
     }
@@ -139,12 +160,12 @@ def test_choice_needs_tolerated_sidelobes_and_keeps_the_requested_filter():
         (np.inf, 1): "reciprocal",
         (np.inf, 1000): "reciprocal",
     }
-    lossy = choose_filter(power, requested="reciprocal", snr=0.01, frames=1000, tolerated_db=-50.0)
+    lossy = choose_filter(power, requested="reciprocal", snr=0.01, frames=1000, **settings)
     assert lossy.flags == {"symbols_noise": "SNR loss of the reciprocal filter 4.3 dB, smallest loss 0.0 dB"}
-    loud = choose_filter(power, requested="matched", snr=0.01, frames=1, tolerated_db=-50.0)
+    loud = choose_filter(power, requested="matched", snr=0.01, frames=1, **settings)
     assert loud.flags["symbols_sidelobes"].startswith("data sidelobes of -29.5 dB after the matched filter, in 1 ")
     assert filter_of(loud.report) == loud.filter
-    assert filter_of({}) == filter_of(None) == SymbolFilter()
+    assert filter_of({}) is None
 
 
 @pytest.mark.parametrize("name", QAM)
@@ -160,3 +181,82 @@ def test_weak_symbols_are_not_taken_for_pulsed_interference(name):
     transfer[::10, 20:22] += 10 ** (45 / 20)
     found = PulsedInterference.measured([transfer], frequency, equal, noise_peak=peak)
     assert found.hits(transfer[::10])[:, 20:22].all()
+
+
+# ---- Sidelink with symbols of varying modulus
+
+
+def sidelink_of(rng, name, snr_db, frames=400):
+    """Return codes, weights, and a sidelink with random delays and phases, divided by the codes."""
+    number = np.arange(SUBCARRIERS) - (SUBCARRIERS - 1) / 2
+    codes = drawn(rng, name, frames)
+    delay, phase = rng.uniform(-9, 9, (frames, 1)), rng.uniform(-np.pi, np.pi, (frames, 1))
+    common = np.exp(1j * phase - 2j * np.pi * number * delay / SUBCARRIERS)
+    received = codes * common + white(rng, frames) * 10 ** (-snr_db / 20)
+    power = np.abs(codes) ** 2
+    weight = (power / power.mean(axis=1, keepdims=True)).astype(np.float32)
+    return codes, weight, common, (received / codes).astype(np.complex64)
+
+
+@pytest.mark.parametrize("name", QAM)
+@pytest.mark.parametrize(("method", "cells"), [("two_parameter", 1), ("gated", 33)])
+def test_weighted_sidelink_has_the_noise_of_a_constant_modulus(name, method, cells):
+    """Residual noise is K/(Nρ) with weights |c|², and P·E[1/|c|²] times as large with equal weights."""
+    rng, snr_db = np.random.default_rng(7), 15.0
+    _, weight, common, sidelink = sidelink_of(rng, name, snr_db, frames=4000)
+    noise = []
+    for of in (weight, None):
+        corrected = METHODS[method](common.astype(np.complex64), sidelink, None, of)
+        noise.append(np.mean(np.abs(corrected - corrected.mean()) ** 2))
+    expected, gain = cells / (SUBCARRIERS * 10 ** (snr_db / 10)), SymbolFilter().noise_gain(powers(name))
+    matched = SymbolFilter.of("matched", powers(name), 1.0).self_noise(powers(name))
+    left = (gain - 1) * matched * cells / SUBCARRIERS  # by one step towards the weighted least squares
+    assert decibels(noise[0] / expected) == pytest.approx(decibels(1 + left), abs=0.25)
+    assert decibels(noise[1] / expected) == pytest.approx(decibels(gain), abs=0.25)
+
+
+def test_weights_lock_the_sidelink_at_the_snr_of_a_constant_modulus():
+    """At Nρ = 14 dB, 64-QAM locks in as many pulses as QPSK, and no more often in noise alone."""
+    rng, level_db = np.random.default_rng(8), 14 - decibels(SUBCARRIERS)
+    rates = {}
+    for name in ("qpsk", "64qam"):
+        _, weight, _, sidelink = sidelink_of(rng, name, level_db, frames=1500)
+        rates[name] = fit_line_of_sight(sidelink, weight).locked.mean()
+    assert rates["64qam"] == pytest.approx(rates["qpsk"], abs=0.04)
+    assert fit_line_of_sight(sidelink).locked.mean() < rates["qpsk"] - 0.3
+    codes = drawn(rng, "64qam", 4000)
+    power = np.abs(codes) ** 2
+    noise = (white(rng, 4000) / codes).astype(np.complex64)
+    locks = fit_line_of_sight(noise, (power / power.mean(axis=1, keepdims=True)).astype(np.float32)).locked.sum()
+    assert locks <= 4000 * LOCK_FALSE_ALARM + 4 * np.sqrt(4000 * LOCK_FALSE_ALARM)
+
+
+def test_weak_symbols_of_a_sidelink_are_not_taken_for_interference():
+    """Noise of 0 dB divided by 64-QAM; a burst of 40 dB is limited with the weights, too."""
+    _, weight, _, sidelink = sidelink_of(np.random.default_rng(9), "64qam", 0.0)
+    assert limited(sidelink)[1].any(axis=1).mean() > 0.9
+    assert limited(sidelink, weight)[1].mean() < 1e-5
+    sidelink[:, 20] += 100 / np.sqrt(weight[:, 20])
+    assert limited(sidelink, weight)[1][:, 20].all()
+
+
+@pytest.mark.parametrize("name", QAM)
+@pytest.mark.parametrize("item", ["reciprocal", "wiener"])
+@pytest.mark.parametrize("snr_db", [-5.0, 15.0])
+@pytest.mark.parametrize("sidelink_db", [12.0, 25.0])
+def test_loss_of_division_by_a_sidelink_equals_the_closed_form(name, item, snr_db, sidelink_db):
+    """Floor of a profile relative to its peak, relative to the same floor with QPSK, within 0.1 dB (eqs. 10, 11)."""
+    rng, frames = np.random.default_rng(10), 1500
+    snr, divided_snr = 10 ** (snr_db / 10), 10 ** (sidelink_db / 10)
+    floors = []
+    for of in (name, "qpsk"):
+        codes, weight, common, sidelink = sidelink_of(rng, of, sidelink_db, frames)
+        chosen = SymbolFilter.of(item if of == name else "reciprocal", powers(of), 1 / (1 / snr + 1 / divided_snr))
+        radar = filtered(codes * common + white(rng, frames) / np.sqrt(snr), codes, chosen)
+        path = fit_line_of_sight(sidelink, weight)
+        corrected = METHODS["divide"](radar.astype(np.complex64), sidelink, path)
+        profile = np.abs(np.fft.fft(corrected, axis=1)) ** 2
+        floors.append(profile[:, 1:].mean() / np.abs(corrected.mean()) ** 2)
+    chosen = SymbolFilter.of(item, powers(name), 1 / (1 / snr + 1 / divided_snr))
+    predicted = chosen.loss(powers(name), snr, None, divided_snr)
+    assert decibels(floors[0] / floors[1]) == pytest.approx(decibels(predicted), abs=0.1)

@@ -14,8 +14,10 @@ from apertura.campaign.store import open_stage, read_manifest
 from apertura.check import problems
 from apertura.common.errors import CampaignError
 from apertura.core.echo.constellation import constellation
+from apertura.core.echo.unknown_symbols import SymbolDecider
 from apertura.core.quality.point_targets import find_peak
 from apertura.simulation import preset, simulate
+from apertura.simulation.impairments import Clock
 from apertura.stages import echo, ingest
 from apertura.stages.scene import open_scene
 from apertura.stages.transfer import PairEcho
@@ -167,6 +169,7 @@ def test_transmitter_is_imaged_by_its_own_recording_of_what_it_sent(tmp_path):
     bits = own_campaign.write(root, pulses=64, loopback=True)["bits"]
     edit_config(root, lambda config: config.update(processing={"symbol_filter": "reciprocal"}))
     stage = formed(root, "uav1-uav1")[1].stage
+    decided = stage.transfer.values
     assert stage.attrs["symbols"]["decided"]["node"] == "uav1"
     assert stage.attrs["flags"] == {}
     edit_config(root, lambda config: config["waveform"].update(codes="raw/codes.npy"))
@@ -175,7 +178,7 @@ def test_transmitter_is_imaged_by_its_own_recording_of_what_it_sent(tmp_path):
     campaign = Campaign.load(root)
     echo.echo(campaign, "f01", "uav1-uav1")
     known = PairEcho.opened(campaign, "f01", "uav1-uav1").stage.transfer.values
-    assert np.allclose(stage.transfer.values, known, atol=1e-5 * np.abs(known).max())
+    assert np.allclose(decided, known, atol=1e-5 * np.abs(known).max())
 
 
 @pytest.mark.slow
@@ -228,6 +231,24 @@ def test_preview_of_ambiguous_symbols_is_bistatic(tmp_path):
     alone, other = advanced(Preview(Campaign.load(tmp_path / "campaign"), follow=False), ended=True)
     assert "ambiguous by quarter turns" in alone.waits
     assert (alone.counts["added"], other.counts["added"], other.waits) == (0, 64, "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", PAIRS)
+def test_finished_echo_decides_the_symbols_of_its_stage_without_measuring_the_sidelink_again(
+    tmp_path, monkeypatch, pair
+):
+    """With a clock offset, transfer functions read from a finished stage are those of the run, bit by bit."""
+    plan = preset("payload", pulses=96)
+    receiver = plan.nodes["uav2"]
+    impairments = replace(receiver.impairments, clock=Clock(cfo_hz=100e3))
+    nodes = {**plan.nodes, "uav2": replace(receiver, impairments=impairments)}
+    root, live, within = simulate(tmp_path / "campaign", replace(plan, nodes=nodes)), list[PairEcho](), PairEcho.within
+    monkeypatch.setattr(PairEcho, "within", lambda self, *names: live.append(self) or within(self, *names))
+    opened = formed(root, pair)[1]
+    monkeypatch.setattr(SymbolDecider, "measured", lambda *_: pytest.fail("the sidelink is measured again"))
+    assert opened.dataset.symbol_clock.values == pytest.approx(100e3, rel=0.01)
+    assert np.array_equal(opened.stage.transfer.values, live[0].stage.transfer.values)
 
 
 def test_framed_symbols_of_a_simulation_require_a_constellation():

@@ -227,6 +227,13 @@ STAGES: Mapping[str, Stage] = {
             "sidelink_vector": Variable(
                 ("pulse", "axis"), "float64", "m", "vector from the receiver's to the transmitter's sidelink antenna"
             ),
+            "symbol_channel": Variable(
+                ("symbol_group", "subcarrier"), "complex64", "1", "mean channel of the sidelink for unknown symbols"
+            ),
+            "symbol_group": Variable(("symbol_group",), "float64", "1", "middle capture index of each mean channel"),
+            "symbol_clock": Variable(
+                ("symbol_capture",), "float64", "Hz", "carrier offset removed from the captures for unknown symbols"
+            ),
         }
         | {
             f"{end}_axes": Variable(

@@ -22,12 +22,12 @@ from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
 from apertura.core.echo.captures import runs, sampled_pulses, spread
+from apertura.core.echo.compression import window_weights
 from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.frame_codes import displacement
 from apertura.core.echo.interference import Interference
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
-from apertura.core.echo.symbol_filter import tolerated_sidelobes_db
 from apertura.core.echo.transfer import (
     Transfer,
     as_complex,
@@ -115,7 +115,7 @@ def pair_echo(
     if sent.unknown is None:
         frames = tx.frames.numbers[pulses.tx_index[paired]]
         frames, displaced = _placed((tx, rx), pulses.rx_index[paired], frames, sent)
-        decided, basis = dict[str, Any](), tx.frames.basis
+        decided, basis, channels = dict[str, Any](), tx.frames.basis, dict[str, Any]()
     else:
         if tx.name == rx.name and not sent.unknown.unambiguous:
             raise ambiguous_symbols()
@@ -130,7 +130,7 @@ def pair_echo(
             {"decided": decision.report(usable)},
             Flags(decision.symbols.flags(usable[decision.rows >= 0])),
         )
-        basis = f"captures of {decision.source}"
+        basis, channels = f"captures of {decision.source}", decision.variables
         processing = processing.model_copy(update={"sidelink": decision.sidelink_method(processing.sidelink)})
     at = tx.raw.time.values[pulses.tx_index[paired]]
     measured, sidelink_m = _transfer((tx, rx), (pulses.rx_index[paired], frames), at, sent, processing, air)
@@ -167,6 +167,7 @@ def pair_echo(
             "path_limit": ("pulse", air_on_track.wave_speed_m_s * (sent.waveform.longest_delay_s - extra_delay_s)),
             **_sidelink(measured),
             **geometry,
+            **channels,
         },
         attrs=_attributes((tx, rx), pulses, positions, measured, repeats, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m, **stated_air(air_on_track)},
@@ -263,8 +264,8 @@ def _transfer(
     """
     (tx, rx), (index, frames) = nodes, captures
     accuracy_db = strictest_accuracy_db(processing.accuracy_db)
-    tolerated_db = tolerated_sidelobes_db(processing.accuracy_db)
-    choose = sent.filter_choice(processing.symbol_filter, frames=frames, tolerated_db=tolerated_db)
+    # a later change of the window does not change the echo: the choice is that of a Hann window
+    choose = sent.filter_choice(processing, frames, window_weights("hann", len(rx.numerology.frequency_hz)))
     sent_ns = nanoseconds(at)
     time_s = (sent_ns - sent_ns[0]) * 1e-9
     if tx.name == rx.name:

@@ -13,10 +13,11 @@ from apertura.campaign.config.processing import HEIGHT_DEFAULT
 from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
+from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.job import Integration, Job
 from apertura.core.echo.compression import centre_frequency, range_step
-from apertura.core.echo.symbol_filter import tolerated_sidelobes_db
+from apertura.core.echo.symbol_filter import filter_of
 from apertura.core.geometry.atmosphere import USUAL_N
 from apertura.core.geometry.gate import EDGE_CELLS, RangeGate
 from apertura.core.imaging.job import decide_integration, imaging_job
@@ -133,16 +134,21 @@ def budget_of(
 
 def symbols_of(campaign: Campaign, pair: OpenPair) -> Mapping[str, Any]:
     """Return the filter of a pair's symbols and its effect, measured or predicted; empty for a constant modulus."""
-    waveform = campaign.settings.waveform
-    if pair.report or not isinstance(waveform, OfdmWaveform):
-        return dict(pair.report.get("symbols", {}))
-    stated = campaign.settings.processing
-    choose = transmitted(campaign, waveform).filter_choice(
-        stated.symbol_filter,
-        frames=np.arange(len(pair.time_s)),
-        tolerated_db=tolerated_sidelobes_db(stated.accuracy_db),
-    )
-    return choose(None).report if choose else {}
+    waveform, symbols = campaign.settings.waveform, dict(pair.report.get("symbols", {}))
+    if not isinstance(waveform, OfdmWaveform) or (pair.report and "filter" not in symbols):
+        return symbols
+    sent = transmitted(campaign, waveform)
+    if not pair.report:
+        choose = sent.filter_choice(campaign.settings.processing, np.arange(len(pair.time_s)), pair.weight)
+        return choose(None, np.inf).report if choose else {}
+    chosen = filter_of(symbols)
+    if chosen is not None and sent.power is not None:  # with the window of the image, which may exclude subcarriers
+        snr, divided_snr = (
+            otherwise if symbols[name] is None else 10 ** (symbols[name] / 10)
+            for name, otherwise in (("snr_db", 0.0), ("divided_snr_db", np.inf))
+        )
+        symbols["loss_db"] = round(decibels(chosen.loss(sent.power, snr, pair.weight, divided_snr)), 2)
+    return symbols
 
 
 def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:

@@ -20,7 +20,7 @@ from apertura.common.provenance import sha256_file
 from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.echo.symbol_filter import filter_of
+from apertura.core.echo.symbol_filter import SymbolFilter, filter_of
 from apertura.core.imaging.noise import PulseNoise, noise_places, sidelink_noise, symbols_noise
 from apertura.core.imaging.radiometry import Calibration, Link, Turn, cell_constant, pointing_std_db
 from apertura.core.imaging.reflectors import DRIFT_SIGMAS
@@ -461,7 +461,7 @@ def calibrated_pair(
     before = None if noise is None else noise * float((opened.weight**2).sum())
     if link and sent:
         inverse = sent.inverses.sampled()
-        filtered = filter_of(symbols).applied(inverse, inverse)
+        filtered = (filter_of(symbols) or SymbolFilter()).applied(inverse, inverse)
         squares = ((opened.weight * np.abs(filtered)) ** 2).sum(axis=1).mean()
         thermal = link.pulse_noise(0.0, spacing_hz=sent.numerology.spacing_hz, squares=float(squares))
     sidelink = opened.report.get("sidelink")

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.campaign.config import CONFIG
@@ -11,32 +12,53 @@ from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.decided_symbols import SidelinkSymbols
 from apertura.core.echo.frame_codes import Inverses
+from apertura.core.echo.unknown_symbols import SymbolDecider
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.stages.acquisition import Captured, common_pulses
 from apertura.stages.transmitted import Transmitted
 
 
-def decided_symbols(source: Captured, sent: Transmitted, accuracy_db: float | Literal["auto"]) -> SidelinkSymbols:
+def decided_symbols(
+    source: Captured, sent: Transmitted, accuracy_db: float | Literal["auto"], stage: xr.Dataset | None = None
+) -> SidelinkSymbols:
     """Return the symbols in the sidelink of all captures of a node.
+
+    Parameters
+    ----------
+    source, sent, accuracy_db
+        Recording of the node, transmitted signal, and `processing.accuracy_db`.
+    stage
+        Stage `echo` with the clock and the mean channels of the sidelink; None: they are measured.
 
     Raises
     ------
     CampaignError
         If the node recorded no sidelink, or no direct path is detected in it.
     """
-    if sent.unknown is None:
+    unknown = sent.unknown
+    if unknown is None:
         raise TypeError("the symbols are known")
-    count, frames = len(source.raw.start), sent.unknown.frames
-    known = None if frames is None else frames.known_labels(sent.unknown.constellation)
+    count, frames = len(source.raw.start), unknown.frames
+    recorded: dict[str, Any] = {
+        "read": source.reader(["sidelink"], np.arange(count)),
+        "numerology": source.numerology,
+        "symbol_samples": sent.waveform.capture_samples,
+        "known": None if frames is None else frames.known_labels(unknown.constellation),
+    }
+    if stage is not None:
+        shapes, middles = stage.symbol_channel.values, stage.symbol_group.values
+        return SidelinkSymbols(
+            **recorded,
+            decider=SymbolDecider(unknown.constellation, shapes, middles, unknown.pilots),
+            clock_hz=stage.symbol_clock.values if "symbol_clock" in stage else None,
+            sfo_ppm=stage.attrs["symbols"]["decided"]["sfo_ppm"],
+        )
     return SidelinkSymbols.measured(
-        source.reader(["sidelink"], np.arange(count)),
-        source.numerology,
-        symbol_samples=sent.waveform.capture_samples,
+        **recorded,
         count=count,
         accuracy_db=strictest_accuracy_db(accuracy_db),
-        constellation=sent.unknown.constellation,
-        pilots=sent.unknown.pilots,
-        known=known,
+        constellation=unknown.constellation,
+        pilots=unknown.pilots,
         where=str(source.files),
     )
 
@@ -106,7 +128,17 @@ class PairSymbols:
 
     def report(self, usable: NDArray[np.bool_]) -> dict[str, Any]:
         """Return the report on the decisions."""
-        return {"node": self.source, **self.symbols.report(usable)}
+        return {"node": self.source, **self.symbols.report(usable), "sfo_ppm": self.symbols.sfo_ppm}
+
+    @property
+    def variables(self) -> dict[str, tuple[tuple[str, ...], NDArray[Any]]]:
+        """Mean channels and clock of the sidelink, from which stage `echo` decides its symbols again."""
+        decider, clock_hz = self.symbols.decider, self.symbols.clock_hz
+        return {
+            "symbol_channel": (("symbol_group", "subcarrier"), decider.shapes),
+            "symbol_group": (("symbol_group",), decider.middles),
+            **({} if clock_hz is None else {"symbol_clock": (("symbol_capture",), clock_hz)}),
+        }
 
 
 def rows_of(tx: Captured, source: Captured, *, prf_hz: float) -> NDArray[np.int64]:

@@ -116,7 +116,7 @@ class PairEcho:
             rx = open_acquisition(campaign, flight, name, sent)
             if source is not None:
                 node = rx if source == name else open_acquisition(campaign, flight, source, sent)
-                sent = with_symbols(sent, node, decided_symbols(node, sent, processing.accuracy_db))
+                sent = with_symbols(sent, node, decided_symbols(node, sent, processing.accuracy_db, stage))
             return rx, sent, processing
 
         return cls.formed(stage, receiver)
@@ -134,7 +134,7 @@ class PairEcho:
             frames = np.zeros(len(rx.raw.start), np.int64)
             frames[dataset.capture.values] = dataset.frame.values
             demodulator = demodulator_of(rx, sent, processing, frames)
-            demodulator = replace(demodulator, filter=filter_of(dataset.attrs.get("symbols")))
+            demodulator = replace(demodulator, filter=filter_of(dataset.attrs.get("symbols", {})))
             tones.update(demodulator.tones)
             for channel in tones.values():
                 channel.lines = tuple(dataset.attrs.get("tone_lines", ()))

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.campaign.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform, SidelinkCodes
+from apertura.campaign.config import CONFIG, OfdmWaveform, Processing, PulseWaveform, SampledWaveform, SidelinkCodes
 from apertura.campaign.folder import Campaign
-from apertura.common.arrays import Complexes
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.common.units import decibels
 from apertura.core.echo.constellation import Constellation, constellation
@@ -18,7 +18,14 @@ from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.core.echo.frame_codes import Inverses, PnCodes, Rows, pn_sequence, sampled_rows
 from apertura.core.echo.frame_format import FrameFormat
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
-from apertura.core.echo.symbol_filter import CONSTANT_DB, FilterChoice, SymbolFilter, choose_filter, echo_snr
+from apertura.core.echo.symbol_filter import (
+    CONSTANT_DB,
+    FilterChoice,
+    SymbolFilter,
+    choose_filter,
+    echo_snr,
+    tolerated_sidelobes_db,
+)
 from apertura.core.echo.trigger import PulseFraming
 from apertura.core.echo.unknown_symbols import Pilots
 from apertura.formats.code_tables import MOST_SYMBOLS, CodeTable
@@ -103,31 +110,36 @@ class Transmitted:
     unknown: "UnknownSymbols | None" = None
 
     def filter_choice(
-        self, requested: str, *, frames: NDArray[np.int64], tolerated_db: float
-    ) -> Callable[[Complexes | None], FilterChoice] | None:
+        self, processing: Processing, frames: NDArray[np.int64], window: Floats
+    ) -> Callable[[Complexes | None, float], FilterChoice] | None:
         """Return the choice of the filter from a sample of transfer functions, None before they are measured.
 
+        Its second argument is the SNR of a sidelink by which they are divided, as of `SymbolFilter.loss`.
         For symbols of constant modulus, there is no choice, and None is returned.
 
         Parameters
         ----------
-        requested
-            `processing.symbol_filter`.
+        processing
+            Settings, of which symbol filter and accuracy are used.
         frames
             (pulse,) int64, frame numbers of the flight.
-        tolerated_db
-            Tolerated level of data sidelobes relative to the peak, dB.
+        window
+            (subcarrier,) float64, window of the range compression.
         """
-        if self.power is None:
+        if self.power is None or decibels(SymbolFilter().noise_gain(self.power)) < CONSTANT_DB:
             return None
         power, different = self.power, len(np.unique(frames % self.inverses.count))
-        gain = SymbolFilter().noise_gain(power)
-        if decibels(gain) < CONSTANT_DB:
-            return None
 
-        def choose(sample: Complexes | None) -> FilterChoice:
-            snr = np.inf if sample is None else echo_snr(sample, gain)
-            return choose_filter(power, requested=requested, snr=snr, frames=different, tolerated_db=tolerated_db)
+        def choose(sample: Complexes | None, divided_snr: float) -> FilterChoice:
+            return choose_filter(
+                power,
+                requested=processing.symbol_filter,
+                snr=np.inf if sample is None else echo_snr(sample, power),
+                frames=different,
+                tolerated_db=tolerated_sidelobes_db(processing.accuracy_db),
+                window=window,
+                divided_snr=divided_snr,
+            )
 
         return choose
 
@@ -204,13 +216,13 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
         unknown = UnknownSymbols.of(waveform.codes, waveform.subcarriers, None if assumes else path)
         points = unknown.constellation.points
         # of the same distribution as the symbols, for averages over pulses
-        typical = np.random.default_rng(0).permutation(np.resize(points, 64 * waveform.subcarriers))
+        typical = np.random.default_rng(0).permutation(np.resize(points, 64 * waveform.subcarriers)).reshape(64, -1)
         return Transmitted(
             waveform,
             symbol_numerology(waveform),
-            Inverses.of_codes(typical.reshape(64, -1)),
+            Inverses.of_codes(typical),
             float(waveform.subcarriers),
-            power=np.square(np.abs(points))[None],
+            power=np.square(np.abs(typical)),
             unknown=unknown,
         )
     if isinstance(waveform, OfdmWaveform):

@@ -4,7 +4,7 @@ Source: docs/theory/data_symbols.md, "Decisions or division".
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,7 @@ class SidelinkSymbols:
     clock_hz, sfo_ppm
         Offset of carrier of each capture (None: not corrected), and of the sampling rate, removed from the samples.
     snr
-        Median SNR per subcarrier of the pulses with a direct path in the groups.
+        Median SNR per subcarrier of the pulses with a direct path in the groups; 0 if it was not measured.
     known
         Labels of the first data symbols of each pulse, of the header; None: the symbols are ambiguous without pilots.
     """
@@ -52,7 +52,6 @@ class SidelinkSymbols:
     sfo_ppm: float
     snr: float = 0.0
     known: Labels | None = None
-    _latest: tuple[Pulses, Complexes] | None = field(default=None, init=False, repr=False)
 
     @classmethod
     def measured(
@@ -122,13 +121,8 @@ class SidelinkSymbols:
         return decisions.path.locked if self.divides else decisions.sure
 
     def inverse(self, captures: Pulses) -> Complexes:
-        """Return 1/ĉ of captures, (pulse, subcarrier) complex64; 0 in pulses that are not used."""
-        latest = self._latest
-        if latest is None or not np.array_equal(latest[0], captures):  # both channels of a block have the same symbols
-            decisions = self.decisions(captures)
-            inverse = self.usable(decisions)[:, None] / decisions.symbols
-            latest = self._latest = captures, inverse.astype(np.complex64)
-        return latest[1]
+        """Return 1/ĉ of captures, (pulse, subcarrier) complex64."""
+        return np.asarray(1 / self.decisions(captures).symbols, np.complex64)
 
     def report(self, usable: NDArray[np.bool_]) -> Mapping[str, Any]:
         """Return the choice between decisions and division with its reason, and the number of unsure pulses."""

@@ -217,7 +217,7 @@ def _usual(values: Floats) -> Floats:
 # ---- Sidelink --------------------------------------------------------------------------------------------------------
 
 
-def limited(spectra: Complexes) -> tuple[Complexes, NDArray[np.bool_]]:
+def limited(spectra: Complexes, weight: NDArray[np.float32] | None = None) -> tuple[Complexes, NDArray[np.bool_]]:
     """Limit subcarriers of a sidelink to 20 times the median power of their pulse; return also which are limited.
 
     A sidelink without interference is unchanged: its direct path has the same power in all subcarriers. A limited
@@ -226,7 +226,10 @@ def limited(spectra: Complexes) -> tuple[Complexes, NDArray[np.bool_]]:
     Parameters
     ----------
     spectra
-        (pulse, subcarrier) complex64.
+        (pulse, subcarrier) complex64, code removed.
+    weight
+        (pulse or 1, subcarrier) float32, inverse noise power of the subcarriers, mean 1 over each pulse: the limit of
+        noisier subcarriers is higher by it. None: equal noise.
 
     Notes
     -----
@@ -241,10 +244,11 @@ def limited(spectra: Complexes) -> tuple[Complexes, NDArray[np.bool_]]:
     power = np.square(spectra.real) + np.square(spectra.imag)
     # The median of some subcarriers is sufficient, and faster.
     usual = np.median(power[:, :: -(-power.shape[1] // _SAMPLES)], axis=1, keepdims=True)
-    over = (power > _HIT * usual) & (usual > 0)
+    limit = _HIT * usual if weight is None else _HIT * usual / np.minimum(weight, 1)
+    over = (power > limit) & (usual > 0)
     if not over.any():
         return spectra, over
-    scale = np.sqrt(_HIT * usual / np.where(over, power, 1.0))
+    scale = np.sqrt(limit / np.where(over, power, 1.0))
     return np.asarray(np.where(over, spectra * scale, spectra), np.complex64), over
 
 
@@ -265,9 +269,9 @@ class SidelinkInterference:
         self._excess = np.zeros(len(frequency_hz))
         self._count = np.zeros(len(frequency_hz), np.int64)
 
-    def limit(self, spectra: Complexes) -> Complexes:
-        """Limit the spectra of a block of pulses, (pulse, subcarrier) complex64."""
-        result, over = limited(spectra)
+    def limit(self, spectra: Complexes, weight: NDArray[np.float32] | None = None) -> Complexes:
+        """Limit the spectra of a block of pulses; parameters as of `limited`."""
+        result, over = limited(spectra, weight)
         self._pulses += len(over)
         if over.any():
             self._limited += int(over.any(axis=1).sum())

@@ -13,6 +13,8 @@ from apertura.core.echo.compression import phasors, unit_phasor
 LOCK_FALSE_ALARM = 1e-3
 """Probability of a lock on a pulse of noise alone."""
 
+Weights = NDArray[np.float32]
+
 _PULSES_AT_ONCE = 64
 _GROUPS = 32
 _NOISE_CELLS = 256  # number of cells for which the median is accurate to 0.4 dB
@@ -31,7 +33,7 @@ class LineOfSight:
     amplitude
         (pulse,) float64, per subcarrier, in the units of the sidelink.
     noise_power
-        (pulse,) float64, per subcarrier.
+        (pulse,) float64, per subcarrier, mean over the subcarriers.
     locked
         (pulse,) bool, True if the path is detected above the noise.
     """
@@ -47,8 +49,8 @@ class LineOfSight:
         return LineOfSight(*(getattr(self, field.name)[pulses] for field in fields(self)))
 
 
-def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
-    """Fit one path to each pulse of a sidelink, (pulse, subcarrier) complex64, by maximum likelihood.
+def fit_line_of_sight(sidelink: Complexes, weight: Weights | None = None) -> LineOfSight:
+    """Fit one path to each pulse of a sidelink by maximum likelihood; parameters as for `fit_block`.
 
     Notes
     -----
@@ -61,8 +63,10 @@ def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
     >>> path.delay_cells.round(4), path.phase_rad.round(4), path.amplitude.round(4), path.locked
     (array([7.3]), array([0.5]), array([3.]), array([ True]))
     """
-    fitted = [fit_block(sidelink[i : i + _PULSES_AT_ONCE])[0] for i in range(0, len(sidelink), _PULSES_AT_ONCE)]
-    return joined(fitted)
+    if weight is not None:
+        weight = np.broadcast_to(weight, sidelink.shape)
+    blocks = [slice(first, first + _PULSES_AT_ONCE) for first in range(0, len(sidelink), _PULSES_AT_ONCE)]
+    return joined([fit_block(sidelink[block], weight if weight is None else weight[block])[0] for block in blocks])
 
 
 def joined(paths: Sequence[LineOfSight]) -> LineOfSight:
@@ -78,13 +82,16 @@ def phasor(path: LineOfSight, subcarriers: int) -> Complexes:
     return np.asarray(along * np.exp(1j * path.phase_rad)[:, None], np.complex64)
 
 
-def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
+def fit_block(sidelink: Complexes, weight: Weights | None = None) -> tuple[LineOfSight, Complexes]:
     """Fit one path to each pulse of a block; return the paths and the profiles aligned so that the path is in cell 0.
 
     Parameters
     ----------
     sidelink
-        (pulse, subcarrier) complex64.
+        (pulse, subcarrier) complex64, code removed.
+    weight
+        (pulse or 1, subcarrier) float32, inverse noise power of the subcarriers, mean 1 over each pulse: |c|² of
+        symbols of varying modulus. None: equal noise.
 
     Returns
     -------
@@ -98,13 +105,15 @@ def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
     0.05 rad.
     """
     subcarriers = sidelink.shape[1]
-    coarse = np.abs(scipy.fft.ifft(sidelink, 2 * subcarriers, axis=1)).argmax(axis=1) / 2
+    weighted = sidelink if weight is None else sidelink * weight
+    coarse = np.abs(scipy.fft.ifft(weighted, 2 * subcarriers, axis=1)).argmax(axis=1) / 2
     delay = np.where(coarse >= subcarriers / 2, coarse - subcarriers, coarse)
     edges = np.unique(np.linspace(0, subcarriers, _GROUPS + 1).astype(int))
-    sums = np.add.reduceat(_aligned(sidelink, delay), edges[:-1], axis=1).astype(np.complex128)
+    sums = np.add.reduceat(_aligned(weighted, delay), edges[:-1], axis=1).astype(np.complex128)
     delay = delay + _residual_cells(sums, (edges[:-1] + edges[1:] - subcarriers) / 2, subcarriers)
-    profile = scipy.fft.ifft(_aligned(sidelink, delay), axis=1)
-    direct = profile[:, 0].astype(np.complex128)
+    aligned = _aligned(sidelink, delay)
+    profile = scipy.fft.ifft(aligned, axis=1)
+    direct = (profile[:, 0] if weight is None else (aligned * weight).mean(axis=1)).astype(np.complex128)
     cells = profile[:, :: max(1, subcarriers // _NOISE_CELLS)]
     power = np.square(cells.real) + np.square(cells.imag)
     # the median of an exponential variable is ln 2 times its mean; a few strong cells (echoes, ripple) have no effect
@@ -113,7 +122,8 @@ def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
     middle = (power[:, half] + power[:, (power.shape[1] - 1) // 2]).astype(np.float64) / 2
     noise = middle / np.log(2) * subcarriers
     amplitude = np.abs(direct)
-    locked = amplitude**2 > _lock_threshold(subcarriers) * noise / subcarriers
+    gain = 1.0 if weight is None else (1 / weight).mean(axis=1)  # of the noise that the weights do not have
+    locked = amplitude**2 > _lock_threshold(subcarriers) * noise / (gain * subcarriers)
     return LineOfSight(delay, np.angle(direct), amplitude, noise, locked), profile
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes
 from apertura.common.units import decibels
-from apertura.core.echo.line_of_sight import LineOfSight, fit_line_of_sight, phasor
+from apertura.core.echo.line_of_sight import LineOfSight, Weights, fit_line_of_sight, phasor
 from apertura.core.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, SidelinkState, measure
 
 __all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]
@@ -32,10 +32,12 @@ FIT_SNR_DB = 13.4
 """N·SNR of the whole pulse, dB, below which errors of the two fitted parameters cause a loss of more than 0.2 dB."""
 
 _PULSES_AT_ONCE = 64
-_Inverse = Callable[[Complexes, LineOfSight], Complexes]
+_Inverse = Callable[[Complexes, LineOfSight, Weights | None], Complexes]
 
 
-def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
+def divide(
+    radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None, weight: Weights | None = None
+) -> Complexes:
     """Return R·A/S, (pulse, subcarrier) complex64 in the units of `radar`.
 
     Where |S| is more than 20 dB below A, in a spectral null or due to noise, it is set to 20 dB below A: a subcarrier
@@ -47,6 +49,9 @@ def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
         (pulse, subcarrier) complex64 of the same captures.
     path
         The direct path of the sidelink as fitted by `measure`; fitted here by default.
+    weight
+        (pulse or 1, subcarrier) float32, inverse noise power of the sidelink's subcarriers, mean 1 over each pulse:
+        |c|² of symbols of varying modulus; None: equal noise. It affects the fit and `gated`.
 
     Notes
     -----
@@ -60,13 +65,15 @@ def divide(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
     array([6., 6., 6.], dtype=float32)
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
+    def inverse(symbols: Complexes, path: LineOfSight, _: Weights | None) -> Complexes:
         return _bounded_inverse(symbols, _amplitude(symbols, path))
 
-    return _correct(radar, sidelink, path, inverse)
+    return _correct(radar, sidelink, path, weight, inverse)
 
 
-def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
+def wiener(
+    radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None, weight: Weights | None = None
+) -> Complexes:
     """Return R·A·S*/(|S|² + σ²), rescaled to preserve the amplitude of the direct path.
 
     Parameters and result as for `divide`; σ² is the noise per subcarrier, measured outside the direct path.
@@ -76,7 +83,7 @@ def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
     Source: docs/theory/echo_methods.md, "Corrections". Without rescaling the peak has a bias of up to SNR/(SNR + 1).
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
+    def inverse(symbols: Complexes, path: LineOfSight, _: Weights | None) -> Complexes:
         amplitude = _amplitude(symbols, path)
         noise = np.where(path.locked, path.noise_power, 0.0)[:, None]  # without lock the noise is unknown
         weakest = _weakest(amplitude)
@@ -85,32 +92,42 @@ def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
         rescaled = regularised / np.maximum(gain, 1e-30)
         return np.asarray(np.where(path.locked[:, None], rescaled, regularised), np.complex64)
 
-    return _correct(radar, sidelink, path, inverse)
+    return _correct(radar, sidelink, path, weight, inverse)
 
 
-def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
+def gated(
+    radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None, weight: Weights | None = None
+) -> Complexes:
     """Return R·A/S with S gated to 16 cells on each side of the direct path.
 
     Parameters and result as for `divide`.
 
     Notes
     -----
-    Source: docs/theory/echo_methods.md, "Corrections". The gate retains the noise of 33 of N cells.
+    Source: docs/theory/echo_methods.md, "Corrections" (the gate retains the noise of 33 of N cells), and
+    docs/theory/changing_codes.md, "Sidelink with symbols of varying modulus", for subcarriers of unequal noise.
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
-        subcarriers = symbols.shape[1]
-        direct = phasor(path, subcarriers)
-        profile = scipy.fft.ifft(symbols * direct.conj(), axis=1)
+    def gate(symbols: Complexes) -> Complexes:
+        profile = scipy.fft.ifft(symbols, axis=1)
         # with fewer than 33 subcarriers, all cells are inside the gate
-        profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0
-        clean = scipy.fft.fft(profile, axis=1) * direct
-        return _bounded_inverse(clean, path.amplitude[:, None].astype(np.float32))
+        profile[:, GATE_CELLS + 1 : symbols.shape[1] - GATE_CELLS] = 0
+        return np.asarray(scipy.fft.fft(profile, axis=1), np.complex64)
 
-    return _correct(radar, sidelink, path, inverse)
+    def inverse(symbols: Complexes, path: LineOfSight, weight: Weights | None) -> Complexes:
+        direct = phasor(path, symbols.shape[1])
+        aligned = symbols * direct.conj()
+        clean = gate(aligned)
+        if weight is not None:  # one step from equal weights to the weighted least squares
+            clean = clean + gate(weight * (aligned - clean))
+        return _bounded_inverse(clean * direct, path.amplitude[:, None].astype(np.float32))
+
+    return _correct(radar, sidelink, path, weight, inverse)
 
 
-def two_parameter(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
+def two_parameter(
+    radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None, weight: Weights | None = None
+) -> Complexes:
     """Return R compensated for one delay and one phase of the direct path per pulse.
 
     Parameters and result as for `divide`.
@@ -120,10 +137,10 @@ def two_parameter(radar: Complexes, sidelink: Complexes, path: LineOfSight | Non
     Source: docs/theory/echo_methods.md, "Two parameters of a pulse".
     """
 
-    def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
+    def inverse(symbols: Complexes, path: LineOfSight, _: Weights | None) -> Complexes:
         return phasor(path, symbols.shape[1]).conj()
 
-    return _correct(radar, sidelink, path, inverse)
+    return _correct(radar, sidelink, path, weight, inverse)
 
 
 METHODS: Mapping[str, Callable[..., Complexes]] = {
@@ -199,8 +216,8 @@ def choose(state: SidelinkState, order: Sequence[str] = tuple(METHODS)) -> tuple
 
 
 def _gain_db(state: SidelinkState, cells: int) -> float:
-    """Return the SNR after removal of all but `cells` delay cells, dB."""
-    return state.snr_db + decibels(state.subcarriers / min(cells, state.subcarriers))
+    """Return the SNR after removal of all but `cells` delay cells with weights of the subcarriers, dB."""
+    return state.snr_db + decibels(state.noise_gain * state.subcarriers / min(cells, state.subcarriers))
 
 
 def _amplitude(symbols: Complexes, path: LineOfSight) -> NDArray[np.float32]:
@@ -221,11 +238,16 @@ def _weakest(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.maximum(amplitude * 10 ** (NULL_DB / 20), 1e-15), np.float32)
 
 
-def _correct(radar: Complexes, sidelink: Complexes, path: LineOfSight | None, inverse: _Inverse) -> Complexes:
-    path = path or fit_line_of_sight(sidelink)
+def _correct(
+    radar: Complexes, sidelink: Complexes, path: LineOfSight | None, weight: Weights | None, inverse: _Inverse
+) -> Complexes:
+    path = path or fit_line_of_sight(sidelink, weight)
+    if weight is not None:
+        weight = np.broadcast_to(weight, sidelink.shape)
     corrected = np.empty(radar.shape, np.complex64)
     for first in range(0, len(radar), _PULSES_AT_ONCE):
         pulses = slice(first, first + _PULSES_AT_ONCE)
+        factors = inverse(sidelink[pulses], path.select(pulses), weight if weight is None else weight[pulses])
         # `out`: for large blocks numpy would reuse the inverse and swap the factors, which changes the rounding
-        np.multiply(radar[pulses], inverse(sidelink[pulses], path.select(pulses)), out=corrected[pulses])
+        np.multiply(radar[pulses], factors, out=corrected[pulses])
     return corrected

@@ -12,7 +12,7 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.common.units import decibels
 from apertura.core.echo.captures import AT_ONCE
-from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, LineOfSight, fit_block, joined
+from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, LineOfSight, Weights, fit_block, joined
 
 # ---- Average of the pulses of a sidelink, aligned to the direct path
 
@@ -189,6 +189,8 @@ class SidelinkState:
         The direct path fitted to each pulse.
     flags
         Flag → measured values, one line.
+    noise_gain
+        Mean noise of a subcarrier relative to that of weighted subcarriers; 1 for a code of constant modulus.
     """
 
     subcarriers: int
@@ -204,6 +206,7 @@ class SidelinkState:
     locked: NDArray[np.bool_]
     path: LineOfSight
     flags: Mapping[str, str]
+    noise_gain: float = 1.0
 
     @property
     def delay_cells(self) -> Floats:
@@ -233,31 +236,36 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
     (17, 0, np.True_)
     """
     return measure_blocks(
-        lambda: (sidelink[first : first + AT_ONCE] for first in range(0, len(sidelink), AT_ONCE)), where
+        lambda: ((sidelink[first : first + AT_ONCE], None) for first in range(0, len(sidelink), AT_ONCE)), where
     )
 
 
-def measure_blocks(blocks: Callable[[], Iterable[Complexes]], where: str = "sidelink") -> SidelinkState:
+Blocks = Callable[[], Iterable[tuple[Complexes, Weights | None]]]
+"""Blocks of a sidelink from its start, code removed, and their weights, as of `fit_block`."""
+
+
+def measure_blocks(blocks: Blocks, where: str = "sidelink") -> SidelinkState:
     """Measure the sidelink of a flight, block by block.
 
-    `blocks` yields the sidelink from its start, (pulse, subcarrier) complex64 each, code removed; it is called again
-    if no pulse locks. Raises CampaignError, whose message contains the recording `where`, if there is no signal.
+    `blocks` is called again if no pulse locks. Raises CampaignError, whose message contains the recording `where`, if
+    there is no signal.
 
     Notes
     -----
     Source: docs/theory/echo_methods.md, "State of a sidelink".
     """
     averaging: Averaging | None = None
-    paths = []
-    for block in blocks():
+    paths, gains = [], []
+    for block, weight in blocks():
         averaging = averaging or Averaging(block.shape[1])
-        direct, profile = fit_block(block)
+        direct, profile = fit_block(block, weight)
         averaging.add(block, direct, profile)
         paths.append(direct)
+        gains.append(1.0 if weight is None else float((1 / weight).mean()))
     path = joined(paths)
     if averaging is None or not path.locked.any():
         return _measure_without_code(blocks, path, where)
-    return _state_of(path, averaging.result())
+    return replace(_state_of(path, averaging.result()), noise_gain=float(np.mean(gains)))
 
 
 def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
@@ -290,10 +298,12 @@ def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
     return replace(state, flags=_flags(state))
 
 
-def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineOfSight, where: str) -> SidelinkState:
+def _measure_without_code(blocks: Blocks, path: LineOfSight, where: str) -> SidelinkState:
     """Distinguish a sidelink of unknown code, whose neighbouring pulses are equal, from a missing sidelink."""
     pulses = path.locked.size
-    common = joined([fit_block(products)[0] for products in _neighbours(blocks())] or [path.select(slice(0))])
+    common = joined(
+        [fit_block(products)[0] for products in _neighbours(block for block, _ in blocks())] or [path.select(slice(0))]
+    )
     if not common.locked.size or common.locked.mean() < 0.5:
         raise CampaignError(
             f"the sidelink locks in none of {pulses} pulses",
@@ -312,7 +322,7 @@ def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineO
         "for any code, so this image is right; monostatic images of the transmitter are wrong"
     )
     flags = {"wrong_code": line}
-    subcarriers = next(iter(blocks())).shape[1]
+    subcarriers = next(iter(blocks()))[0].shape[1]
     return SidelinkState(subcarriers, snr_db, -300.0, 0, False, 0.0, 0, 0.0, -300.0, 0.0, locked, path, flags)
 
 

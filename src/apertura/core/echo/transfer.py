@@ -17,6 +17,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.progress import progress
+from apertura.common.units import decibels
 from apertura.core.echo.association import BaselineResidual, baseline_residual, detect_wrong_association
 from apertura.core.echo.captures import (
     Pulses,
@@ -31,7 +32,7 @@ from apertura.core.echo.captures import (
 from apertura.core.echo.clock import GROUPS, clock_of, decide_clock
 from apertura.core.echo.demodulate import Numerology, demodulate
 from apertura.core.echo.interference import SidelinkInterference, limited
-from apertura.core.echo.line_of_sight import LineOfSight
+from apertura.core.echo.line_of_sight import LineOfSight, Weights
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
 from apertura.core.echo.sidelink import DIVIDING, LEAST_NOISE, METHODS, choose, edges
 from apertura.core.echo.sidelink_spikes import find_spikes
@@ -42,8 +43,9 @@ from apertura.core.echo.tones import Tones
 Inverse = Callable[[Pulses], Complexes]
 """Ascending capture numbers, as of `Read` → inverse spectra of their transmitted pulses, as of `Inverses.at`."""
 
-ChooseSymbols = Callable[[Complexes], FilterChoice]
-"""Sample of transfer functions divided by the code → filter of the symbols."""
+ChooseSymbols = Callable[[Complexes, float], FilterChoice]
+"""Sample of transfer functions divided by the code, and SNR of the sidelink by which they are divided, per subcarrier
+with a constant modulus (infinite: not divided) → filter of the symbols."""
 
 _INVERTED = (
     "the conjugate samples contain the code: set waveform.iq to swapped if I and Q are swapped, or to conjugate if the "
@@ -96,14 +98,14 @@ class Demodulator:
     tones
         Channel → removal of tones of other transmitters; empty: tones are not removed.
     filter
-        Filter of the radar channel; the sidelink, which is divided by, has the reciprocal one.
+        Filter of symbols of varying modulus in the radar channel; None: the modulus is constant.
     """
 
     inverse: Inverse
     numerology: Numerology
     symbol_samples: int
     tones: Mapping[str, Tones] = field(default_factory=dict)
-    filter: SymbolFilter = field(default_factory=SymbolFilter)
+    filter: SymbolFilter | None = None
 
     @classmethod
     def without_tones(cls, inverse: Inverse, numerology: Numerology, symbol_samples: int) -> "Demodulator":
@@ -143,12 +145,22 @@ class Demodulator:
         correction
             Correction of these pulses; None for a node that receives its own echoes.
         """
+        clock = (None, 0.0) if correction is None else (correction.clock_hz, correction.sfo_ppm)
+        radar = self.symbols(iq["radar"], captures, *clock)
+        if self.filter is not None:
+            radar = self.filter.applied(radar, self.inverse(captures))
         if correction is None:
-            return self.filter.applied(self.symbols(iq["radar"], captures), self.inverse(captures))
-        clock = correction.clock_hz, correction.sfo_ppm
-        radar, sidelink = (self.symbols(iq[name], captures, *clock, channel=name) for name in ("radar", "sidelink"))
-        radar = self.filter.applied(radar, self.inverse(captures))
-        return METHODS[correction.method](radar, limited(sidelink)[0], correction.path)
+            return radar
+        sidelink, weight = self.symbols(iq["sidelink"], captures, *clock, channel="sidelink"), self.weight(captures)
+        return METHODS[correction.method](radar, limited(sidelink, weight)[0], correction.path, weight)
+
+    def weight(self, captures: Pulses) -> Weights | None:
+        """Return |c|² of symbols of varying modulus, mean 1 over each pulse, the weights of a sidelink."""
+        if self.filter is None:
+            return None
+        inverse = self.inverse(captures)
+        power = 1 / (np.square(inverse.real) + np.square(inverse.imag))
+        return np.asarray(power / power.mean(axis=1, keepdims=True), np.float32)
 
 
 @dataclass(frozen=True)
@@ -200,7 +212,7 @@ def transfer_by_code(
     time_s
         (capture,) float64, times of transmission, seconds from any origin.
     choose_symbols
-        Choice of the filter of the symbols; None: the reciprocal.
+        Choice of the filter of symbols of varying modulus; None: the modulus is constant.
 
     Notes
     -----
@@ -232,7 +244,7 @@ def transfer_by_code(
     flags = Flags.merged(code.flags, inverted, phase.flags if phase else {})
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
     if choose_symbols is not None:
-        choice = choose_symbols(sample)
+        choice = choose_symbols(sample, np.inf)
         demodulator = replace(demodulator, filter=choice.filter)
         flags, report["symbols"] = Flags.merged(flags, choice.flags), choice.report
     formed = forming(read, demodulator, saturation)
@@ -275,7 +287,7 @@ def transfer_by_sidelink(
         (capture,) float64, time of transmission, seconds from any origin, to exclude pulses in which only the sidelink
         is disturbed; None: these are not searched for, as on a bench.
     choose_symbols
-        Choice of the filter of the radar channel's symbols; None: the reciprocal.
+        Choice of the filter of symbols of varying modulus in the radar channel; None: the modulus is constant.
 
     Raises
     ------
@@ -289,11 +301,13 @@ def transfer_by_sidelink(
     """
     # First pass: measure the clock on a sample of captures, and the state of the sidelink on all captures.
     numerology = demodulator.numerology
+    if choose_symbols is not None:
+        demodulator = replace(demodulator, filter=SymbolFilter())
     receiver = _Receiver.measured(read, demodulator, len(sidelink_m), accuracy_db)
     interference = SidelinkInterference(numerology.frequency_hz)
     with progress("sidelinks", len(sidelink_m)) as done:
         try:
-            state = measure_blocks(lambda: map(interference.limit, receiver.sidelink(done)), f"{where}: sidelink")
+            state = measure_blocks(lambda: receiver.sidelink(interference, done), f"{where}: sidelink")
         except CampaignError as unlocked:
             if not _compresses_conjugated(read, demodulator, len(sidelink_m)):
                 raise
@@ -328,12 +342,13 @@ def transfer_by_sidelink(
         {"association_suspect": wrong} if wrong else {},
         {"spectrum_inverted": _INVERTED} if inverted else {},
     )
-    quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
+    quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual, chosen)}
     if not np.array_equal(kept, state.locked):
         quality["spikes"] = int((state.locked & ~kept).sum())
     report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
     if choose_symbols is not None:
-        choice = choose_symbols(receiver.radar())
+        divided = chosen in DIVIDING
+        choice = choose_symbols(receiver.radar(), state.noise_gain * 10 ** (state.snr_db / 10) if divided else np.inf)
         demodulator = replace(demodulator, filter=choice.filter)
         flags, report["symbols"] = Flags.merged(flags, choice.flags), choice.report
     # Second pass, block by block on demand.
@@ -424,12 +439,16 @@ class _Receiver:
         corrected = (clock.cfo_of_pulses_hz(count), clock.sfo_ppm) if decision.correct else ()
         return cls(read, demodulator, count, report, decision.flags, *corrected)
 
-    def sidelink(self, done: Callable[[int], None]) -> Iterator[Complexes]:
-        """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, with the code removed."""
+    def sidelink(
+        self, interference: SidelinkInterference, done: Callable[[int], None]
+    ) -> Iterator[tuple[Complexes, Weights | None]]:
+        """Yield the limited symbols of the sidelink with the code removed, and their weights, as of `fit_block`."""
         for block in blocks_of(np.arange(self.count)):
             clock_hz = None if self.clock_hz is None else self.clock_hz[block]
             iq = self.read(block)["sidelink"]
-            yield self.demodulator.symbols(iq, block, clock_hz, self.sfo_ppm, channel="sidelink")
+            symbols = self.demodulator.symbols(iq, block, clock_hz, self.sfo_ppm, channel="sidelink")
+            weight = self.demodulator.weight(block)
+            yield interference.limit(symbols, weight), weight
             done(len(block))
 
     def radar(self) -> Complexes:
@@ -448,10 +467,11 @@ class _Receiver:
         )
 
 
-def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) -> dict[str, float]:
+def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None, method: str) -> dict[str, float]:
+    gain = 1.0 if method in DIVIDING else state.noise_gain  # the other methods weight the subcarriers
     report = {
         "lock_rate": round(float(state.locked.mean()), 4),
-        "snr_db": round(state.snr_db, 2),
+        "snr_db": round(state.snr_db + decibels(gain), 2),
         "echo_db": round(state.echo_db, 2),
         "ripple_db": round(max(state.ripple_db, state.fine_ripple_db), 2),
     }
