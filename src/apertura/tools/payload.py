@@ -178,7 +178,7 @@ def _summary(columns: Mapping[str, NDArray[Any]], unknown: UnknownSymbols, prf_h
     intact, rate_bit_s = counts["intact"] / max(seen.size, 1), frames.data_bits * prf_hz
     measured = dict[str, float | None](snr_db=None, evm_db=None, header_bit_error_rate=None)
     if seen.any():
-        # eqs. 3 and 15
+        # eqs. 3 and 16
         expected = qam.symbol_error_rate(10 ** (columns["snr_db"][seen] / 10))
         measured = {name: round(float(np.median(columns[name][seen])), 2) for name in ("snr_db", "evm_db")}
         measured["header_bit_error_rate"] = float(columns["header_errors"][seen].mean() / frames.header.size)

@@ -38,8 +38,6 @@ class SidelinkSymbols:
         Decider with the mean channels of the sidelink.
     clock_hz, sfo_ppm
         Offset of carrier of each capture (None: not corrected), and of the sampling rate, removed from the samples.
-    snr
-        Median SNR per subcarrier of the pulses with a direct path in the groups; 0 if it was not measured.
     known
         Labels of the first data symbols of each pulse, of the header; None: the symbols are ambiguous without pilots.
     """
@@ -50,7 +48,6 @@ class SidelinkSymbols:
     decider: SymbolDecider
     clock_hz: Floats | None
     sfo_ppm: float
-    snr: float = 0.0
     known: Labels | None = None
 
     @classmethod
@@ -86,20 +83,17 @@ class SidelinkSymbols:
                 clock_hz, sfo_ppm = clock.cfo_of_pulses_hz(count), clock.sfo_ppm
         empty = SymbolDecider(constellation, np.ones((1, 1), np.complex64), np.zeros(1), pilots)
         symbols = cls(read, numerology, symbol_samples, empty, clock_hz, sfo_ppm, known=known)
-        received = {group[0]: (group, symbols.received(group)) for group in _groups(count)}
         try:
-            symbols.decider = SymbolDecider.measured(received.values(), constellation, pilots)
+            received = ((group, symbols.received(group)) for group in _groups(count))
+            symbols.decider = SymbolDecider.measured(received, constellation, pilots)
         except CampaignError as error:
             raise CampaignError(error.found, f"{where}: sidelink", error.expected, error.remedy) from None
-        decided = [symbols.decider.decide(block, group) for group, block in received.values()]
-        snr = np.concatenate([decisions.snr[decisions.path.locked] for decisions in decided])
-        symbols.snr = float(np.median(snr)) if snr.size else 0.0
         return symbols
 
     @property
     def divides(self) -> bool:
         """True if division by the noisy sidelink has the smaller error, because most decisions are unsure (eq. 7)."""
-        return self.snr < self.decider.constellation.least_snr
+        return self.decider.snr < self.decider.constellation.least_snr
 
     def received(self, captures: Pulses) -> Complexes:
         """Return the received symbols of the sidelink in captures, (pulse, subcarrier) complex64."""
@@ -126,13 +120,13 @@ class SidelinkSymbols:
 
     def report(self, usable: NDArray[np.bool_]) -> Mapping[str, Any]:
         """Return the choice between decisions and division with its reason, and the number of unsure pulses."""
-        qam = self.decider.constellation
-        decided, divided_db = qam.decided(self.snr), decibels(qam.noise_gain / self.snr)
+        qam, snr = self.decider.constellation, self.decider.snr
+        decided, divided_db = qam.decided(snr), decibels(qam.noise_gain / snr)
         method = "division" if self.divides else "decisions"
         # of division: the mean of 1/S in noise (docs/theory/echo_methods.md, "Corrections")
-        gain = 1 - np.exp(-self.snr) if self.divides else decided.gain
+        gain = 1 - np.exp(-snr) if self.divides else decided.gain
         limits = (
-            f"SNR {decibels(self.snr):.1f} dB per subcarrier, {qam.name} requires {decibels(qam.least_snr):.1f} dB: "
+            f"SNR {decibels(snr):.1f} dB per subcarrier, {qam.name} requires {decibels(qam.least_snr):.1f} dB: "
             f"decisions lose {-20 * np.log10(decided.gain):.2f} dB and leave an error of {decibels(decided.error):.1f} "
             f"dB, division an error of {divided_db:.1f} dB"
         )
@@ -140,9 +134,9 @@ class SidelinkSymbols:
             "method": method,
             "reason": limits,
             "constellation": qam.name,
-            "snr_db": round(decibels(self.snr), 2),
+            "snr_db": round(decibels(snr), 2),
             "evm_db": round(float(20 * np.log10(decided.evm)), 2),
-            "symbol_error_rate": float(f"{float(qam.symbol_error_rate(self.snr)):.2e}"),
+            "symbol_error_rate": float(f"{float(qam.symbol_error_rate(snr)):.2e}"),
             "loss_db": round(float(20 * np.log10(max(gain, 1e-10))), 3) + 0.0,
             "error_db": round(divided_db if self.divides else decibels(decided.error), 2),
             "unsure": int((~usable).sum()),
@@ -150,10 +144,10 @@ class SidelinkSymbols:
 
     def flags(self, usable: NDArray[np.bool_]) -> dict[str, str]:
         """Return a flag if pulses are unsure, or if decisions are so unsure that echoes are divided."""
-        unsure, qam = int((~usable).sum()), self.decider.constellation
+        unsure, qam, snr = int((~usable).sum()), self.decider.constellation, self.decider.snr
         if self.divides:
             line = (
-                f"SNR {decibels(self.snr):.1f} dB, below {decibels(qam.least_snr):.1f} dB of {qam.name}: echoes are "
+                f"SNR {decibels(snr):.1f} dB, below {decibels(qam.least_snr):.1f} dB of {qam.name}: echoes are "
                 "divided by the noisy sidelink"
             )
             return {"symbols_unsure": line}

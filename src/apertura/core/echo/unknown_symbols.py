@@ -7,9 +7,9 @@ Source: docs/theory/data_symbols.md, "Unknown symbols".
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -22,8 +22,13 @@ from apertura.core.echo.line_of_sight import LineOfSight, fit_block, phasor
 from apertura.core.echo.sidelink_state import GATE_CELLS
 
 _UPDATES = 3  # fits of delay, phase and amplitude to the decisions
-_LARGEST_CHANGE = 0.2  # amplitude of a reflection, relative to the direct path, that the mean channel does not contain
-_CHANNELS = 3  # estimates of the channel of a pulse
+_REFLECTIONS = 3  # largest number of reflections of a pulse that its initial channel contains
+_SIGNIFICANT = 3.3  # amplitude of a reflection relative to its standard deviation: 2 % of pulses without one
+_CHANNELS = 8  # largest number of estimates of the channel of a pulse
+_LEAST_GAIN = 0.99  # error vector magnitude relative to the previous one, above which an estimate is not used
+# Limits of a pulse with right symbols: power of its channel before the direct path relative to it, and excess of its
+# noise over the median of its group, standard deviations
+_MOST_EARLY, _NOISE_SIGMAS = 0.03, 5.0
 _ROUNDS = 4  # fits of the mean channel to the decisions
 
 
@@ -97,7 +102,8 @@ class Decisions:
     snr
         (pulse,) float64, SNR per subcarrier that corresponds to the error vector magnitude.
     sure
-        (pulse,) bool, True if the direct path is detected and the error vector magnitude is below its limit.
+        (pulse,) bool, True if the direct path is detected, the error vector magnitude is below its limit, and noise
+        and channel are those of right symbols.
     """
 
     symbols: Complexes
@@ -106,6 +112,21 @@ class Decisions:
     evm: Floats
     snr: Floats
     sure: Bools
+
+
+class _Pulses(NamedTuple):
+    """Solution of a block of pulses."""
+
+    path: LineOfSight
+    symbols: Complexes
+    labels: Labels
+    error: Floats
+    channel: Complexes
+
+    @property
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """Arrays with one row per pulse."""
+        return (*(getattr(self.path, field.name) for field in fields(LineOfSight)), *self[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +144,10 @@ class SymbolDecider:
         (group,) float64, number of the middle pulse of each group, ascending.
     pilots
         Known symbols; None: delay and phase are estimated from the constellation.
+    noise
+        (group,) float64, median noise per subcarrier of the pulses of each group; None: not measured.
+    snr
+        Median SNR per subcarrier of the pulses with a direct path in the groups; 0 if it was not measured.
 
     Examples
     --------
@@ -141,6 +166,8 @@ class SymbolDecider:
     shapes: Complexes
     middles: Floats
     pilots: Pilots | None = None
+    noise: Floats | None = None
+    snr: float = 0.0
 
     @classmethod
     def measured(
@@ -163,7 +190,7 @@ class SymbolDecider:
         CampaignError
             If the direct path is not detected in any group.
         """
-        shapes, middles, count = [], [], 0
+        shapes, middles, noise, snrs, count = [], [], [], [], 0
         for numbers, received in groups:
             count += len(numbers)
             decider = cls(constellation, np.ones((1, received.shape[1]), np.complex64), np.zeros(1), pilots)
@@ -171,6 +198,10 @@ class SymbolDecider:
             if shaped is not None:
                 shapes.append(shaped.shapes[0])
                 middles.append(float(numbers.mean()))
+                decisions = shaped.decide(received, numbers)
+                locked = decisions.path.locked
+                noise.append(float(np.median(decisions.path.noise_power[locked])) if locked.any() else np.inf)
+                snrs.append(decisions.snr[locked])
         if not shapes:
             raise CampaignError(
                 f"no direct path of {constellation.name} symbols in {count} pulses",
@@ -178,7 +209,9 @@ class SymbolDecider:
                 expected=f"data symbols of constellation {constellation.name} above the noise",
                 remedy="Check waveform.codes.constellation, and antenna, gain and recorded channel of the sidelink.",
             )
-        return cls(constellation, np.array(shapes), np.array(middles), pilots)
+        snr = np.concatenate(snrs)
+        median_snr = float(np.median(snr)) if snr.size else 0.0
+        return cls(constellation, np.array(shapes), np.array(middles), pilots, np.array(noise), median_snr)
 
     def _shaped_by(self, received: Complexes) -> "SymbolDecider | None":
         """Return a decider with the mean channel of pulses; None if the direct path is not detected in any pulse."""
@@ -213,31 +246,49 @@ class SymbolDecider:
         numbers
             (pulse,) pulse numbers, as those of the groups.
         """
-        subcarriers = sidelink.shape[1]
         nearest = np.searchsorted((self.middles[1:] + self.middles[:-1]) / 2, numbers)
         shape = self.shapes[nearest]
-        flat = sidelink / shape
-        path, symbols, labels, error = self._fitted(flat, self._detected(flat), shape)
-        # Channel of each pulse within ±16 cells of the direct path (eq. 12), which absorbs a part of the noise
+        pulse = self._solved(sidelink, shape)
+        rows, reflected = _reflections(sidelink / shape)  # a second start, with reflections that the shape lacks
+        if rows.size:
+            second = self._solved(sidelink[rows], shape[rows] * reflected)
+            better = second.error < _LEAST_GAIN * pulse.error[rows]
+            for of_all, of_rows in zip(pulse.arrays, second.arrays, strict=True):
+                of_all[rows[better]] = of_rows[better]
+        path, error = pulse.path, pulse.error
+        path = replace(path, noise_power=np.square(path.amplitude * error) * np.square(np.abs(pulse.channel)).mean(1))
+        doubt = np.zeros(len(numbers))  # eq. 15
+        if self.noise is not None:
+            excess = path.noise_power / np.maximum(self.noise[nearest], 1e-30) - 1
+            doubt += np.maximum(excess, 0) * np.sqrt(sidelink.shape[1]) / _NOISE_SIGMAS
+        if self.pilots is None:
+            doubt += _early(pulse.channel / shape) / _MOST_EARLY
+        limit = self.constellation.decided(self.constellation.least_snr).evm
+        sure = path.locked & (error <= limit) & (doubt <= 1)
+        return Decisions(pulse.symbols, pulse.labels, path, error, self.constellation.snr_of_evm(error), sure)
+
+    def _solved(self, sidelink: Complexes, initial: Complexes) -> "_Pulses":
+        """Return the symbols of pulses from an initial channel, (pulse, subcarrier), and the channel of each pulse.
+
+        The channel is estimated within ±16 cells of the direct path (eq. 12), and absorbs a part of the noise.
+        """
+        subcarriers, flat = sidelink.shape[1], sidelink / initial
+        path, symbols, labels, error = self._fitted(flat, self._detected(flat), initial)
         absorbed, rows = _basis(subcarriers).shape[1] / subcarriers, np.flatnonzero(path.locked)
         direct = phasor(path, subcarriers) * np.maximum(path.amplitude, 1e-30)[:, None].astype(np.float32)
+        pulses = _Pulses(path, symbols, labels, error, initial.copy())
         for _ in range(_CHANNELS):
             if not rows.size:
                 break
             relative = _smooth(flat[rows] / (direct[rows] * symbols[rows]))
-            of_rows = path.select(rows)
-            _, own, own_labels, own_error = self._fitted(
-                flat[rows] / relative, of_rows, shape[rows] * relative, updates=0
-            )
-            own_error /= np.sqrt(1 - absorbed)
-            better = own_error < error[rows]
+            channel = initial[rows] * relative
+            own = self._fitted(flat[rows] / relative, path.select(rows), channel, updates=0)
+            own_error = own[3] / np.sqrt(1 - absorbed)
+            better = own_error < _LEAST_GAIN * error[rows]
             rows = rows[better]
-            symbols[rows], labels[rows], error[rows] = own[better], own_labels[better], own_error[better]
-        clear = self.pilots is not None or _reflection(flat) < _LARGEST_CHANGE
-        limit = self.constellation.decided(self.constellation.least_snr).evm
-        path = replace(path, noise_power=np.square(path.amplitude * error))
-        snr = self.constellation.snr_of_evm(error)
-        return Decisions(symbols, labels, path, error, snr, path.locked & (error <= limit) & clear)
+            for of_all, of_rows in zip(pulses.arrays[-4:], (own[1], own[2], own_error, channel), strict=True):
+                of_all[rows] = of_rows[better]
+        return pulses
 
     def resolved(self, decisions: Decisions, known: Labels) -> Decisions:
         """Return decisions without the ambiguity of a blind estimate, from known labels of the first subcarriers.
@@ -371,12 +422,45 @@ def _minimum_phase(received: Complexes) -> Complexes:
     return np.asarray(np.exp(scipy.fft.fft(cepstrum)), np.complex64)
 
 
-def _reflection(flat: Complexes) -> Floats:
-    """Return the amplitude of the strongest reflection in each pulse, (pulse, subcarrier), from its power (eq. 14)."""
+def _reflections(flat: Complexes) -> tuple[NDArray[np.intp], Complexes]:
+    """Return the pulses of a block with reflections in their power, and the minimum-phase channels of these (eq. 14).
+
+    The strongest reflection is fitted to the power of the pulse, which is divided by its effect, and so on.
+    """
+    subcarriers = flat.shape[1]
     power = np.square(flat.real) + np.square(flat.imag)
     power /= np.maximum(power.mean(1, keepdims=True), 1e-30)
-    correlation = scipy.fft.rfft(power - 1, 2 * power.shape[1], axis=1)[:, 2:]
-    return np.asarray(np.abs(correlation).max(1) / power.shape[1], np.float64)
+    deviation = np.sqrt(np.square(power - 1).mean(1) / subcarriers)  # of the amplitude of a reflection
+    screened = np.abs(scipy.fft.rfft(power - 1, 2 * subcarriers, axis=1)[:, 2:]).max(1) / subcarriers
+    rows = np.flatnonzero(screened > _SIGNIFICANT * deviation)
+    power, number = power[rows], np.arange(subcarriers) - (subcarriers - 1) / 2
+    channel, fine = np.ones(power.shape, np.complex64), 8  # steps per cell
+    for _ in range(_REFLECTIONS if rows.size else 0):
+        rest = power / (np.square(channel.real) + np.square(channel.imag))
+        rest = rest / np.maximum(rest.mean(1, keepdims=True), 1e-30) - 1
+        correlation = scipy.fft.rfft(rest, fine * subcarriers, axis=1).conj() / subcarriers
+        correlation[:, :fine] = 0
+        step = np.abs(correlation).argmax(1)
+        cells = step / fine
+        peak = correlation[np.arange(len(rows)), step] * np.exp(-1j * np.pi * cells * (subcarriers - 1) / subcarriers)
+        level = np.minimum(np.abs(peak), 0.45)  # a/(1 + a²) of a reflection of amplitude a
+        amplitude = 2 * level / (1 + np.sqrt(1 - 4 * level**2))
+        amplitude *= np.abs(peak) > _SIGNIFICANT * np.sqrt(np.square(rest).mean(1) / subcarriers)
+        delayed = np.exp(1j * (np.angle(peak)[:, None] - 2 * np.pi * number * cells[:, None] / subcarriers))
+        channel = (channel * (1 + amplitude[:, None] * delayed)).astype(np.complex64)
+    return rows, channel
+
+
+def _early(relative: Complexes) -> Floats:
+    """Return the power of channels, (pulse, subcarrier), before the direct path, relative to it (eq. 15)."""
+    taper = np.hanning(relative.shape[1]).astype(np.float32)
+    power = np.square(np.abs(scipy.fft.ifft(relative * taper, axis=1)))
+    return np.asarray(power[:, -_gate(relative.shape[1]) : -1].sum(1) / np.maximum(power[:, 0], 1e-30), np.float64)
+
+
+def _gate(subcarriers: int) -> int:
+    """Return the half width of the gate, cells; of few subcarriers, most of the noise remains outside."""
+    return min(GATE_CELLS, max(subcarriers // 64, 1))
 
 
 @lru_cache(maxsize=4)
@@ -384,9 +468,9 @@ def _basis(subcarriers: int) -> NDArray[np.float32]:
     """Return an orthonormal basis, (subcarrier, function), of channels within ±16 cells of the direct path.
 
     Discrete prolate spheroidal sequences represent reflections at fractions of a cell without the sidelobes of a gate
-    in delay. Of few subcarriers, the gate is narrower, so that most of the noise remains outside.
+    in delay.
     """
-    cells = min(GATE_CELLS, max(subcarriers // 64, 1))
+    cells = _gate(subcarriers)
     # eigenvectors of the tridiagonal matrix that commutes with the band limitation (Slepian 1978, eq. 14)
     number = np.arange(subcarriers)
     diagonal = np.square((subcarriers - 1 - 2 * number) / 2) * np.cos(2 * np.pi * cells / subcarriers)
