@@ -101,6 +101,31 @@ def test_noisy_sidelink_is_divided_and_flagged(tmp_path):
 
 
 @pytest.mark.slow
+def test_monostatic_echo_uses_sure_symbols_only(tmp_path):
+    """Around the least SNR of 16-QAM, 11.4 dB: some pulses are excluded; at 8 dB, all are, and the error names the SNR.
+
+    Before, all pulses were used, and the report stated the loss of division: 0.00 instead of 1.1 dB at 8 dB.
+    """
+    stages = []
+    for name, sidelink_db in (("limit", 11.4), ("clear", 25.0)):
+        own_campaign.write(tmp_path / name, pulses=64, sidelink_db=sidelink_db)
+        stages.append(formed(tmp_path / name, "uav1-uav1")[1].stage)
+    limit, clear = stages
+    decided = limit.attrs["symbols"]["decided"]
+    assert decided["method"] == "decisions"
+    assert 0 < decided["unsure"] < 64
+    assert f"symbols of {decided['unsure']} of 64 pulses are unsure" in limit.attrs["flags"]["symbols_unsure"]
+    both = np.isin(clear.time.values, limit.time.values)
+    measured, truth = limit.transfer.values, clear.transfer.values[both]
+    gain = np.vdot(truth, measured).real / np.vdot(truth, truth).real
+    assert 20 * np.log10(gain) == pytest.approx(decided["loss_db"], abs=0.15)
+    assert "symbols_unsure" not in clear.attrs["flags"]
+    own_campaign.write(tmp_path / "noisy", pulses=64, sidelink_db=8.0)
+    with pytest.raises(CampaignError, match=r"all 64 pulses are unsure; .*at least 11.4 dB for 16qam"):
+        formed(tmp_path / "noisy", "uav1-uav1")
+
+
+@pytest.mark.slow
 def test_monostatic_image_without_header_and_pilots_is_refused(tmp_path):
     """The phase of blind symbols is ambiguous; a bistatic pair does not need it."""
     root = tmp_path / "campaign"

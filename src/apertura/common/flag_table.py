@@ -244,7 +244,7 @@ _OF_RECORDINGS = {
     ),
     "symbols_unsure": Flag(
         "pulses excluded; or SNR of the sidelink and required SNR, dB",
-        "the data symbols of pulses cannot be decided; of most pulses: echoes are divided by the noisy sidelink",
+        "the data symbols of pulses are unsure; of most pulses: bistatic echoes are divided by the noisy sidelink",
         "SNR and reflections of the sidelink; waveform.codes: constellation, pilots",
         "core/echo/decided_symbols.py",
     ),

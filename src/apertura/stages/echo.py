@@ -123,13 +123,10 @@ def pair_echo(
             source, rows = rx, pulses.rx_index
         else:
             rows = rows_of(tx, source, prf_hz=sent.waveform.prf_hz)[pulses.tx_index]
-        decision = PairSymbols.of(source, sent, rows[paired], processing.accuracy_db)
+        decision = PairSymbols.of(source, sent, rows[paired], processing.accuracy_db, is_monostatic=tx.name == rx.name)
         usable = decision.usable()
         sent, frames, paired = decision.sent, decision.rows[usable], paired[usable]
-        decided, displaced = (
-            {"decided": decision.report(usable)},
-            Flags(decision.symbols.flags(usable[decision.rows >= 0])),
-        )
+        decided, displaced = {"decided": decision.report(usable)}, Flags(decision.flags(usable))
         basis, channels = f"captures of {decision.source}", decision.variables
         processing = processing.model_copy(update={"sidelink": decision.sidelink_method(processing.sidelink)})
     at = tx.raw.time.values[pulses.tx_index[paired]]

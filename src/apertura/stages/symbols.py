@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.campaign.config import CONFIG
 from apertura.common.errors import CampaignError
+from apertura.common.units import decibels
 from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.decided_symbols import SidelinkSymbols
 from apertura.core.echo.frame_codes import Inverses
@@ -75,16 +76,25 @@ class PairSymbols:
         (pulse,) int64, row of each pulse; -1 if the source did not record it.
     symbols, source
         Symbols of the source, and its name.
+    is_monostatic
+        True if the pulses are those of a monostatic pair, whose echo cannot be divided by the sidelink of the source.
     """
 
     sent: Transmitted
     rows: NDArray[np.int64]
     symbols: SidelinkSymbols
     source: str
+    is_monostatic: bool
 
     @classmethod
     def of(
-        cls, source: Captured, sent: Transmitted, rows: NDArray[np.int64], accuracy_db: float | Literal["auto"]
+        cls,
+        source: Captured,
+        sent: Transmitted,
+        rows: NDArray[np.int64],
+        accuracy_db: float | Literal["auto"],
+        *,
+        is_monostatic: bool = False,
     ) -> "PairSymbols":
         """Return the symbols of pulses that the captures `rows` of `source` contain in their sidelink.
 
@@ -102,13 +112,29 @@ class PairSymbols:
                 remedy="Set waveform.codes.node to a node with a sidelink, or name the channel in apertura:channels.",
             )
         symbols = decided_symbols(source, sent, accuracy_db)
-        return cls(with_symbols(sent, source, symbols), rows, symbols, name)
+        return cls(with_symbols(sent, source, symbols), rows, symbols, name, is_monostatic)
 
     def usable(self) -> NDArray[np.bool_]:
-        """Return True for pulses whose symbols are used; all pulses are decided, block by block."""
+        """Return True for pulses whose symbols are used; all pulses are decided, block by block.
+
+        Raises
+        ------
+        CampaignError
+            If no pulse is used.
+        """
         usable = np.zeros(len(self.rows), bool)
         for block in blocks_of(np.flatnonzero(self.rows >= 0)):
-            usable[block] = self.symbols.usable(self.symbols.decisions(self.rows[block]))
+            decisions = self.symbols.decisions(self.rows[block])
+            usable[block] = self.symbols.usable(decisions, divided=self._divided)
+        if not usable.any():
+            qam = self.symbols.decider.constellation
+            raise CampaignError(
+                f"the symbols of all {len(usable)} pulses are unsure",
+                where=f"sidelink of {self.source}",
+                expected=f"an SNR of at least {decibels(qam.least_snr):.1f} dB for {qam.name}",
+                remedy="Check antenna, gain and reflections of the sidelink, and waveform.codes. Bistatic pairs do not "
+                "need sure symbols: they are divided by the sidelink.",
+            )
         return usable
 
     def header_errors(self, captures: NDArray[np.int64]) -> float:
@@ -124,11 +150,20 @@ class PairSymbols:
         """Return the sidelink correction; of `auto`, division if symbols are unsure, else the one with least noise."""
         if requested != "auto":
             return requested
-        return "divide" if self.symbols.divides else "least_noise"
+        return "divide" if self.symbols.unsure else "least_noise"
 
     def report(self, usable: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return the report on the decisions."""
-        return {"node": self.source, **self.symbols.report(usable), "sfo_ppm": self.symbols.sfo_ppm}
+        """Return the report on the decisions; `usable`: pulses that are used."""
+        stated = self.symbols.report(usable, divided=self._divided)
+        return {"node": self.source, **stated, "sfo_ppm": self.symbols.sfo_ppm}
+
+    def flags(self, usable: NDArray[np.bool_]) -> dict[str, str]:
+        """Return a flag if pulses that the source recorded are unsure; `usable`: pulses that are used."""
+        return self.symbols.flags(usable[self.rows >= 0], divided=self._divided)
+
+    @property
+    def _divided(self) -> bool:
+        return self.symbols.unsure and not self.is_monostatic
 
     @property
     def variables(self) -> dict[str, tuple[tuple[str, ...], NDArray[Any]]]:

@@ -91,8 +91,8 @@ class SidelinkSymbols:
         return symbols
 
     @property
-    def divides(self) -> bool:
-        """True if division by the noisy sidelink has the smaller error, because most decisions are unsure (eq. 7)."""
+    def unsure(self) -> bool:
+        """True if most decisions are unsure, so that division by the noisy sidelink has the smaller error (eq. 7)."""
         return self.decider.snr < self.decider.constellation.least_snr
 
     def received(self, captures: Pulses) -> Complexes:
@@ -110,50 +110,58 @@ class SidelinkSymbols:
             return self.decider.resolved(decisions, self.known)
         return decisions
 
-    def usable(self, decisions: Decisions) -> Bools:
+    def usable(self, decisions: Decisions, *, divided: bool) -> Bools:
         """Return True for pulses whose symbols are used: sure ones, or all with a direct path if echoes are divided."""
-        return decisions.path.locked if self.divides else decisions.sure
+        return decisions.path.locked if divided else decisions.sure
 
     def inverse(self, captures: Pulses) -> Complexes:
         """Return 1/ĉ of captures, (pulse, subcarrier) complex64."""
         return np.asarray(1 / self.decisions(captures).symbols, np.complex64)
 
-    def report(self, usable: NDArray[np.bool_]) -> Mapping[str, Any]:
-        """Return the choice between decisions and division with its reason, and the number of unsure pulses."""
+    def report(self, usable: NDArray[np.bool_], *, divided: bool) -> Mapping[str, Any]:
+        """Return the choice between decisions and division with its reason, and the number of unsure pulses.
+
+        Parameters
+        ----------
+        usable
+            (pulse,) bool, pulses that are used.
+        divided
+            True if echoes are divided by the noisy sidelink.
+        """
         qam, snr = self.decider.constellation, self.decider.snr
         decided, divided_db = qam.decided(snr), decibels(qam.noise_gain / snr)
-        method = "division" if self.divides else "decisions"
         # of division: the mean of 1/S in noise (docs/theory/echo_methods.md, "Corrections")
-        gain = 1 - np.exp(-snr) if self.divides else decided.gain
+        gain = 1 - np.exp(-snr) if divided else decided.gain
         limits = (
             f"SNR {decibels(snr):.1f} dB per subcarrier, {qam.name} requires {decibels(qam.least_snr):.1f} dB: "
             f"decisions lose {-20 * np.log10(decided.gain):.2f} dB and leave an error of {decibels(decided.error):.1f} "
             f"dB, division an error of {divided_db:.1f} dB"
         )
         return {
-            "method": method,
+            "method": "division" if divided else "decisions",
             "reason": limits,
             "constellation": qam.name,
             "snr_db": round(decibels(snr), 2),
             "evm_db": round(float(20 * np.log10(decided.evm)), 2),
             "symbol_error_rate": float(f"{float(qam.symbol_error_rate(snr)):.2e}"),
             "loss_db": round(float(20 * np.log10(max(gain, 1e-10))), 3) + 0.0,
-            "error_db": round(divided_db if self.divides else decibels(decided.error), 2),
+            "error_db": round(divided_db if divided else decibels(decided.error), 2),
             "unsure": int((~usable).sum()),
         }
 
-    def flags(self, usable: NDArray[np.bool_]) -> dict[str, str]:
-        """Return a flag if pulses are unsure, or if decisions are so unsure that echoes are divided."""
-        unsure, qam, snr = int((~usable).sum()), self.decider.constellation, self.decider.snr
-        if self.divides:
+    def flags(self, usable: NDArray[np.bool_], *, divided: bool) -> dict[str, str]:
+        """Return a flag if pulses are unsure, or if echoes are divided; parameters as of `report`."""
+        qam, snr = self.decider.constellation, self.decider.snr
+        if divided:
             line = (
                 f"SNR {decibels(snr):.1f} dB, below {decibels(qam.least_snr):.1f} dB of {qam.name}: echoes are "
                 "divided by the noisy sidelink"
             )
             return {"symbols_unsure": line}
-        if not unsure:
+        if usable.all():
             return {}
-        return {"symbols_unsure": f"symbols of {unsure} of {usable.size} pulses are unsure; these pulses are excluded"}
+        line = f"symbols of {(~usable).sum()} of {usable.size} pulses are unsure; these pulses are excluded"
+        return {"symbols_unsure": line}
 
 
 def _groups(count: int) -> list[Pulses]:

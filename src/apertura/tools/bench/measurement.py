@@ -524,7 +524,7 @@ class _Coded:
                 return self._decided(orders, every)
             of_source = self.code(source)
             rows = rows_of(captured, of_source.captured, prf_hz=self.sent.waveform.prf_hz)
-            code = _Code.of(captured, replace(cast("PairSymbols", of_source.decided), rows=rows))
+            code = _Code.of(captured, replace(cast("PairSymbols", of_source.decided), rows=rows, is_monostatic=True))
         conjugate = replace(code, captured=orders[1])
         return conjugate if not code.locks(channel) and conjugate.locks(channel) else code
 
@@ -570,7 +570,7 @@ def _node(coded: _Coded, name: str) -> BenchNode:
     before, clock, contact, state, link, method = None, None, None, None, None, str(processing.sidelink)
     if code.decided is not None:
         method, known = code.decided.sidelink_method(method), np.isin(every, code.used)
-        raised = code.decided.symbols.flags(known[code.decided.rows >= 0])
+        raised = code.decided.flags(known)
         flags.append({key: f"{name}: {line}" for key, line in raised.items()})
     measured: Transfer | None = None
     used, time_s = code.used, time_s[code.used]
