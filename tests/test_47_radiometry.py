@@ -118,6 +118,22 @@ def test_noise_figure_of_symbols_of_varying_modulus_is_that_of_the_receiver(tmp_
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("symbol_filter", ["reciprocal", "matched"])
+def test_noise_figure_of_a_scene_of_noise_does_not_contain_the_gain_of_the_filter(tmp_path, symbol_filter):
+    """Without echoes, the noise of 64-QAM is that of the receiver, times 2.7 (reciprocal) or 1 (matched)."""
+    base = plan()
+    weak = tuple(replace(target, amplitude=1e-3 * target.amplitude) for target in base.targets)
+    changing = replace(base, targets=weak, waveform=replace(base.waveform, code="64qam", frames=120))
+    root = simulate(tmp_path / "campaign", changing, seed=3)
+    edit_config(root, lambda document: document.update(processing={"symbol_filter": symbol_filter}))
+    campaign = run_steps(root, exports=False)
+    layers(campaign, "f01", "uav1-uav1")
+    noise = report_of(campaign, "uav1-uav1")["noise"]
+    assert abs(noise["noise_figure_measured_db"] - 6) < 1
+    assert noise["std_db"] < 0.5
+
+
+@pytest.mark.slow
 def test_receiver_gain_error_of_6_db_is_flagged_from_noise(flown, tmp_path):
     """By eq. 8b, noise is compared with the configured noise figure or, if not configured, with 0 dB."""
     assert not any("noise_disagrees" in report_of(flown, pair)["flags"] for pair in PAIRS)

@@ -246,7 +246,9 @@ class CalibratedPair:
     sidelink_noise
         Noise power that the sidelink adds to a profile; 0 without a sidelink.
     symbols_noise
-        Noise power in a profile from symbols of varying modulus; 0 for the reciprocal filter.
+        Noise power in a profile from symbols of varying modulus, of echoes and noise; 0 for the reciprocal filter.
+    self_noise
+        Variance κ of the echo amplitude over the data, of `symbols_noise`.
     noise_figure_db
         Configured noise figure; None if it is not configured.
     pointing_std_db
@@ -264,6 +266,7 @@ class CalibratedPair:
     noise_before: float | None
     sidelink_noise: float
     symbols_noise: float
+    self_noise: float
     noise_figure_db: float | None
     pointing_std_db: float
 
@@ -359,15 +362,16 @@ class CalibratedPair:
         Source: docs/theory/radiometry.md, eqs. 8, 8a and 8b.
         """
         added = self.sidelink_noise + self.symbols_noise
-        receiver_noise = pulse_noise.power - added
+        # the factors of `symbols_noise` multiply the receiver noise in the transfer functions, too
+        receiver_noise = (pulse_noise.power - added) * (1 + self.self_noise)
         report = {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": None, "std_db": None}
         report |= {"sidelink": self.sidelink_noise or None}
         report |= {"symbols": self.symbols_noise} if self.symbols_noise else {}
         differences = list[tuple[str, float, float]]()
         if self.thermal_noise and receiver_noise > 0:  # False for NaN
             figure_db = decibels(receiver_noise / self.thermal_noise)
-            measured_std_db = (
-                np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * added) / receiver_noise
+            measured_std_db = np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * added) / (
+                pulse_noise.power - added
             )
             report |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(float(measured_std_db), 2)}
             radio_db = _UNSTATED_STD_DB if self.radio_std_db is None else self.radio_std_db
@@ -455,7 +459,7 @@ def calibrated_pair(
         count=count,
         threads=threads,
     )
-    thermal, added, by_symbols = None, 0.0, 0.0
+    thermal, added, by_symbols, self_noise = None, 0.0, 0.0, 0.0
     symbols = opened.report.get("symbols", {})
     noise = measured[0].profile_noise if measured else None
     before = None if noise is None else noise * float((opened.weight**2).sum())
@@ -470,7 +474,8 @@ def calibrated_pair(
         if sidelink:
             added = sidelink_noise(*where, beams=beams, method=sidelink["method"], snr_db=sidelink["snr_db"])
         if symbols.get("self_noise") and symbols.get("rows", 1) > 1:  # of equal symbols, the sidelobes are constant
-            by_symbols = symbols_noise(*where, beams=beams, self_noise=symbols["self_noise"])
+            self_noise = symbols["self_noise"]
+            by_symbols = symbols_noise(*where, beams=beams, self_noise=self_noise)
     pointing_db = pointing_std_db(beams, opened.aperture, scene.middle_m, _attitude_errors(campaign, opened, scene))
     return CalibratedPair(
         source,
@@ -484,6 +489,7 @@ def calibrated_pair(
         before,
         added,
         by_symbols,
+        self_noise,
         figure_db,
         pointing_db,
     )
