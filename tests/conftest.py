@@ -48,6 +48,7 @@ def pytest_collection_modifyitems(config, items):
             met.update(matching)
             if not matching:
                 item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)  # short tests fill the gaps between long ones
     unmatched = [f"{function}[{row}]" for function, row in named.keys() - met]
     if unmatched and not any("::" in arg for arg in config.args):
         raise pytest.UsageError(f"marked quick, and no test: {', '.join(sorted(unmatched))}")
@@ -157,7 +158,14 @@ def finished_sample(shared, all_steps, tmp_path_factory):
 
 
 def pytest_generate_tests(metafunc):
-    """Run tests with `isa` on every instruction set of the compiled engine; only the default set is quick."""
+    """Run tests with `isa` on every instruction set of the compiled engine; only the default set is quick.
+
+    Tests with `reader` run in this process; tests without rows also run with the reader in its own process (slow).
+    """
+    if "reader" in metafunc.fixturenames:
+        has_rows = any(metafunc.definition.iter_markers("parametrize"))
+        isolated = [] if has_rows else [pytest.param("isolated", marks=pytest.mark.slow)]
+        metafunc.parametrize("reader", ["here", *isolated], indirect=True)
     if "isa" in metafunc.fixturenames:
         from apertura.core.backprojection.engines import native, native_binding
 
@@ -185,9 +193,9 @@ def toy(monkeypatch):
     monkeypatch.setitem(ENGINES, "toy", "toy_engine")
 
 
-@pytest.fixture(params=["here", pytest.param("isolated", marks=pytest.mark.slow)])
+@pytest.fixture
 def reader(request, monkeypatch):
-    """Run readers that may crash in this process (fast); in `make test-slow`, also in a separate process."""
+    """Run readers that may crash in this process (fast) or, if isolated, in a separate process as in a run."""
     if request.param == "here":
         from in_this_process import Processes
 
