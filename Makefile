@@ -94,7 +94,7 @@ test-slow test-all: export EXAMPLES := all
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow" $(TESTS)
 
-# Folders of tests that passed are deleted at once, because the slow tests write 4.5 GB.
+# The slow tests, or all. Folders of tests that passed are deleted at once, because the slow tests write 4.5 GB.
 test-slow test-all: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal $(if $(filter test-slow,$@),-m slow) -o tmp_path_retention_policy=failed $(TESTS)
 
