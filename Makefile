@@ -7,7 +7,7 @@ TESTS ?= tests src research
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup webmap demo run bench paper stability pages gallery docs wheel wheel-test test test-slow attack cluster-test crate-check lint format lock clean
+.PHONY: setup webmap demo run bench paper stability pages gallery docs wheel wheel-test test test-slow test-all attack cluster-test crate-check lint format lock clean
 
 setup: $(SETUP)
 
@@ -89,14 +89,14 @@ wheel-test: $(SETUP)
 	$(BIN)/python -m tests.wheels $(if $(EMULATE),--emulate)
 
 # What pytest makes of the asserts is kept for the next run, also where Python is told to write no bytecode.
-test test-slow: export PYTHONDONTWRITEBYTECODE :=
-test-slow: export EXAMPLES := all
+test test-slow test-all: export PYTHONDONTWRITEBYTECODE :=
+test-slow test-all: export EXAMPLES := all
 test: $(SETUP)
-	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "not slow" $(TESTS)
 
-# Folders of tests that passed are deleted at once, because the slow tests write 4.5 GB.
-test-slow: $(SETUP)
-	$(BIN)/python -m pytest -q -n 2 -m slow -o tmp_path_retention_policy=failed $(TESTS)
+# The slow tests, or all. Folders of tests that passed are deleted at once, because the slow tests write 4.5 GB.
+test-slow test-all: $(SETUP)
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal $(if $(filter test-slow,$@),-m slow) -o tmp_path_retention_policy=failed $(TESTS)
 
 # Every parser on thousands of wrong files, every step killed, starved and short of disk, whole runs killed, and every
 # physical mistake: hours.
@@ -122,8 +122,7 @@ lint: $(SETUP)
 	$(BIN)/snakefmt --check Snakefile workflow research/study.smk
 	$(BIN)/clang-format --dry-run -Werror native/*.?pp
 	$(BIN)/lint-imports
-	rm -rf build/lint && $(BIN)/apertura simulate build/lint >/dev/null
-	$(BIN)/snakemake --lint --directory build/lint
+	$(BIN)/snakemake --lint --directory .test
 
 format: $(SETUP)
 	$(BIN)/ruff check --fix src research tests benchmarks website

@@ -4,15 +4,20 @@ Nothing of apertura is imported before a test needs it: the process that only di
 """
 
 import fcntl
+import functools
 import gc
 import os
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
 import pytest
+from _pytest.doctest import DoctestModule
 
 # Arrays in tests are small, and a test has one core: idle BLAS threads took a third of the total time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# No file of a test needs to survive a power failure; tests of synchronisation replace the function themselves.
+os.fsync = lambda _: None
 
 # These files run in the environments of roc-validator and of QGIS.
 collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
@@ -20,6 +25,12 @@ collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
 
 COMPILING = {"apertura.core.imaging.backproject.backproject", "apertura.core.imaging.judgement.judge"}
 """Doctests that are marked slow because they start the compiler of numba."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collect_file():
+    """Collect no doctests from the tests, which would also import every program beside them."""
+    return [collector for collector in (yield) if not isinstance(collector, DoctestModule)]
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -37,14 +48,29 @@ def pytest_collection_modifyitems(config, items):
             met.update(matching)
             if not matching:
                 item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)  # short tests fill the gaps between long ones
     unmatched = [f"{function}[{row}]" for function, row in named.keys() - met]
     if unmatched and not any("::" in arg for arg in config.args):
         raise pytest.UsageError(f"marked quick, and no test: {', '.join(sorted(unmatched))}")
 
 
-def pytest_collection_finish():
-    """Exclude imported objects from garbage collection, since they stay alive until the end."""
-    gc.freeze()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Exclude imported modules and collected tests from garbage collection, since they stay alive until the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _command_tree():
+    """Build the tree of commands once per process, not for each command line."""
+    import typer.main
+
+    typer.main.get_command = functools.cache(typer.main.get_command)
 
 
 @pytest.fixture(scope="session")
@@ -132,7 +158,14 @@ def finished_sample(shared, all_steps, tmp_path_factory):
 
 
 def pytest_generate_tests(metafunc):
-    """Run tests with `isa` on every instruction set of the compiled engine; only the default set is quick."""
+    """Run tests with `isa` on every instruction set of the compiled engine; only the default set is quick.
+
+    Tests with `reader` run in this process; tests without rows also run with the reader in its own process (slow).
+    """
+    if "reader" in metafunc.fixturenames:
+        has_rows = any(metafunc.definition.iter_markers("parametrize"))
+        isolated = [] if has_rows else [pytest.param("isolated", marks=pytest.mark.slow)]
+        metafunc.parametrize("reader", ["here", *isolated], indirect=True)
     if "isa" in metafunc.fixturenames:
         from apertura.core.backprojection.engines import native, native_binding
 
@@ -160,9 +193,9 @@ def toy(monkeypatch):
     monkeypatch.setitem(ENGINES, "toy", "toy_engine")
 
 
-@pytest.fixture(params=["here", pytest.param("isolated", marks=pytest.mark.slow)])
+@pytest.fixture
 def reader(request, monkeypatch):
-    """Run readers that may crash in this process (fast); in `make test-slow`, also in a separate process."""
+    """Run readers that may crash in this process (fast) or, if isolated, in a separate process as in a run."""
     if request.param == "here":
         from in_this_process import Processes
 

@@ -7,6 +7,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.echo.captures import runs, sampled_pulses
 from apertura.core.echo.compression import compress, window_weights
 from apertura.core.echo.interference import EXCESS_DB, Interference
+from apertura.simulation.scatterers import spectrum
 
 FREQUENCY = 1.15e9 + 0.4e6 * np.arange(512)
 WEIGHT = window_weights("hann", 512)
@@ -18,8 +19,8 @@ def received(*, tone_db=None, noise=1.0, pulses=400, seed=1):
     """Return echoes of three targets from a moving platform, noise, and a tone relative to the power of one echo."""
     rng = np.random.default_rng(seed)
     paths_m = TARGETS_M + 0.002 * np.arange(pulses)[:, None] * np.array([1.0, -0.5, 0.2])
-    echo = np.exp(-2j * np.pi * np.remainder(paths_m[..., None] / C * FREQUENCY, 1.0)).sum(axis=1)
-    total = echo + rng.normal(size=(*echo.shape, 2)) @ np.array([1, 1j]) * noise / np.sqrt(2)
+    echo = spectrum(paths_m / C, np.ones(paths_m.shape, complex), FREQUENCY)
+    total = echo + rng.normal(size=(*echo.shape, 2)).view(complex)[..., 0] * noise / np.sqrt(2)
     if tone_db is not None:  # relative to one echo, summed over the subcarriers
         total[:, TONE] += np.sqrt(512) * 10 ** (tone_db / 20) * np.exp(2j * np.pi * rng.random(pulses))
     return total.astype(np.complex64)

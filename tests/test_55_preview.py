@@ -553,9 +553,15 @@ def test_slow_drawing_does_not_end_a_recording(tiny, tmp_path, monkeypatch):
     assert all(node.complete for node in preview.nodes.values())
 
 
+@pytest.fixture(scope="session")
+def run_without_preview(_tiny, made_once):
+    """The tiny campaign run by `apertura run`; read only."""
+    return made_once("without_preview", lambda root: replayed.run_without_look(_tiny, root, cores=2))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ends", ["by its hash", "by Ctrl-C"])
-def test_previewed_replay_gives_the_results_of_a_run(tiny, tmp_path, ends):
+def test_previewed_replay_gives_the_results_of_a_run(tiny, run_without_preview, tmp_path, ends):
     root = tmp_path / "replayed"
     replayed.begin(tiny, root)
     words = [APERTURA, "preview", root, "--follow", "--every", "1", "--end-after", "600", "--cores", "2"]
@@ -571,7 +577,6 @@ def test_previewed_replay_gives_the_results_of_a_run(tiny, tmp_path, ends):
         printed = process.communicate(timeout=400)[0]
     assert process.returncode == 0, printed
     assert "s behind" in printed
-    other = replayed.run_without_look(root, tmp_path / "other", cores=2)
-    first, second = (replayed.hashes_of(folder / "results") for folder in (other, root))
+    first, second = (replayed.hashes_of(folder / "results") for folder in (run_without_preview, root))
     assert "f01/fused/coherent_db.tif" in first
     assert first == second

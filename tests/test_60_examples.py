@@ -102,7 +102,7 @@ def test_drift_estimation_without_a_reflector_is_refused(rail_pass):
 def test_rail_pass_is_aligned_by_image_sharpness_within_10_cm(rail_pass):
     (rail_pass / "config/clocks.tsv").unlink()
     campaign = Campaign.load(rail_pass)
-    alignment, stated = align(campaign, "passA", "radar", search_m=6.0)
+    alignment, stated = align(campaign, "passA", "radar", search_m=4.0)
     write_clock(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=alignment.offset_width_s)
     config = rail_pass / "config/config.yaml"
     config.write_text(config.read_text().replace("radar: 3.8194", f"radar: {stated['path_offset_m']:.4f}"))

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
@@ -141,12 +142,17 @@ def _outside_files(planted: Planted) -> None:
         (planted.outside / name).write_bytes(b"<9> +proj=utm +zone=32 +datum=WGS84 <>\n")
 
 
+@cache
+def _installed() -> frozenset[str]:
+    """Return the names of the modules of all installed packages."""
+    return frozenset(name for name in packages_distributions() if name.isidentifier())
+
+
 def _modules(planted: Planted, *, in_snakemakes_own: bool) -> Mapping[str, str]:
     """Return modules for all names that Python or an installed package may import."""
-    installed = {name for name in packages_distributions() if name.isidentifier()}
     names = {
         *sys.stdlib_module_names,
-        *installed,
+        *_installed(),
         "apertura",
         "sitecustomize",
         "usercustomize",

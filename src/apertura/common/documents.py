@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -285,7 +286,7 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
     try:
         value = adapter.validate_python(document)
     except ValidationError as error:
-        found = _complaints(error, adapter.json_schema())
+        found = _complaints(error, *_tags_and_keys(model))  # type: ignore[arg-type]  # a class is hashable
         if all(item["type"] == "value_error" for item in error.errors(include_url=False, include_context=False)):
             expected = "consistent values"  # keys and types are valid
         raise CampaignError(found, where=where, expected=expected, remedy="Correct these keys.") from error
@@ -297,6 +298,15 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
             found = f"{quoted(key)[1:-1]} is {quoted(number)}"
             raise CampaignError(found, where, f"numbers within ±{LARGEST_NUMBER:g}", "Correct this value.")
     return value
+
+
+@cache
+def _tags_and_keys(model: Any) -> tuple[set[str], set[str]]:
+    """Return the names of alternative types and the keys in the JSON schema of a model."""
+    schema = TypeAdapter(model).json_schema()
+    return _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {})), _collected(
+        schema, _properties
+    )
 
 
 def _numbers(value: object, location: tuple[str, ...]) -> Iterator[tuple[str, float]]:
@@ -311,10 +321,10 @@ def _numbers(value: object, location: tuple[str, ...]) -> Iterator[tuple[str, fl
         yield ".".join(location), abs(value)
 
 
-def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
+def _complaints(error: ValidationError, tags: set[str], keys: set[str]) -> str:
     wrong: dict[str, list[str]] = {}
     for item in error.errors(include_url=False, include_context=False)[: 10 * _MOST_COMPLAINTS]:
-        key, line = _complaint(dict(item), schema)
+        key, line = _complaint(dict(item), tags, keys)
         wrong.setdefault(quoted(key)[1:-1], []).append(line)
     lines = [f"{key}: {' or '.join(complaints[:_MOST_COMPLAINTS])}" for key, complaints in wrong.items()]
     lines.sort(key=lambda line: "unknown key" not in line)
@@ -322,16 +332,15 @@ def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
     return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and more, {error.error_count()} in total" if more else "")
 
 
-def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
+def _complaint(item: dict[str, Any], tags: set[str], keys: set[str]) -> tuple[str, str]:
     """Return a key and its error; the location of the key is stripped of the names of alternative types."""
-    tags = _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {}))
     parts, unknown = [*map(str, item["loc"])], item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}
     own = parts[-1:] if unknown else []  # always a key, even if it has the name of an alternative type
     parents = parts[:-1] if unknown else parts
     location = [part for part in parents if not (re.match(_TYPE, part) or part in tags)] + own
     key = ".".join(location) or "the whole file"
     if unknown:
-        known = sorted(_collected(schema, _properties) - {location[-1]})  # the key may belong to another section
+        known = sorted(keys - {location[-1]})  # the key may belong to another section
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.5)
         return key, "unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
     if item["type"] == "missing":

@@ -359,7 +359,7 @@ def block_contributions(
     sums = np.zeros((len(places_m), edges.size - 1), np.complex64)
     add = _add_compiled if available() else _add
     for pieces in _chunks(edges, weights, pulses_at_once(profiles)):
-        parts = [part for _block, part in pieces]
+        parts = _joined(pieces)
         add(Echoes.read(profiles, parts), places_m, pieces, np.concatenate([weights[part] for part in parts]), sums)
     return sums
 
@@ -367,10 +367,10 @@ def block_contributions(
 def _chunks(edges: NDArray[np.int64], weights: NDArray[np.float64], most: int) -> Iterator[list[Piece]]:
     """Yield chunks of at most `most` pulses, as lists of blocks or parts of blocks with nonzero weight."""
     chunk: list[Piece] = []
-    free = most
+    free, weighted = most, [0, *np.cumsum(weights != 0).tolist()]
     for block, (first, end) in enumerate(pairwise(edges.tolist())):
         start = first
-        while start < end and weights[start:end].any():
+        while start < end and weighted[start] < weighted[end]:
             count = min(free, end - start)
             chunk.append((block, slice(start, start + count)))
             start += count
@@ -380,6 +380,17 @@ def _chunks(edges: NDArray[np.int64], weights: NDArray[np.float64], most: int) -
                 chunk, free = [], most
     if chunk:
         yield chunk
+
+
+def _joined(pieces: list[Piece]) -> list[slice]:
+    """Return the pulses of pieces as slices; adjacent pieces are joined."""
+    parts: list[slice] = []
+    for _block, part in pieces:
+        if parts and parts[-1].stop == part.start:
+            parts[-1] = slice(parts[-1].start, part.stop)
+        else:
+            parts.append(part)
+    return parts
 
 
 def _borders(pieces: list[Piece]) -> NDArray[np.int64]:

@@ -118,6 +118,6 @@ def _height_ranges(grid: SceneGrid, terrain: Terrain, strip: list[Window]) -> It
     """Yield the lowest and highest height in each window of a strip."""
     rows, (left, right) = strip[0][0], (strip[0][1].start, strip[-1][1].stop)
     heights = terrain.heights(grid[rows, slice(left, right)])
-    for _, columns in strip:
-        part = heights[:, columns.start - left : columns.stop - left]
-        yield float(part.min()), float(part.max())
+    starts = [columns.start - left for _, columns in strip]
+    lowest, highest = np.minimum.reduceat(heights.min(axis=0), starts), np.maximum.reduceat(heights.max(axis=0), starts)
+    yield from zip(lowest.tolist(), highest.tolist(), strict=True)

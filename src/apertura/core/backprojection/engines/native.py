@@ -401,6 +401,7 @@ def pixel_steps(ground_m: NDArray[np.float64], axis: int, spacing_m: float) -> N
     return np.asarray(spacing_m * along / np.linalg.norm(along, axis=-1, keepdims=True))
 
 
+@lru_cache(maxsize=1024)
 def path_variants(
     view: View, *, cell_m: float, wavenumber_rad_m: float, tolerance_rad: float
 ) -> tuple[tuple[float, float, float], float]:
