@@ -146,7 +146,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     campaign = Campaign.load(root)
     for flight in campaign.image_flights:
         if isinstance(campaign.settings.waveform, SampledWaveform):
-            for node in flight.nodes:
+            for node in flight.recorded:
                 ingest.ingest(campaign, flight.name, node)
         for pair in flight.pairs:
             echo.echo(campaign, flight.name, pair)

@@ -11,8 +11,11 @@ import zarr
 from folders import complaint, edit_config, expected_plan, small_simulation
 
 from apertura.campaign.folder import Campaign
+from apertura.common.errors import CampaignError
 from apertura.core.echo.constellation import constellation
+from apertura.core.echo.demodulate import Numerology
 from apertura.core.echo.frame_codes import Inverses, PnCodes, displacement, frame_numbers, pn_sequence
+from apertura.core.echo.transfer import Demodulator, transfer_by_code
 from apertura.formats.code_tables import CodeTable
 from apertura.simulation import Impairments, preset, simulate
 from apertura.simulation.continuous import Framing
@@ -350,3 +353,38 @@ def test_noise_of_a_sidelink_with_64_qam_is_that_of_a_constant_modulus(tmp_path,
         noise[code] = np.mean(np.abs(formed - clean) ** 2)
         assert snr_db is None or stage.attrs["sidelink"]["snr_db"] == pytest.approx(snr_db, abs=0.5)
     assert 10 * np.log10(noise["64qam"] / noise["qpsk"]) == pytest.approx(0, abs=1.0)  # 200 errors of phase and delay
+
+
+@pytest.mark.parametrize(
+    ("wrong", "noise", "carried"),
+    [(slice(0), 0.1, True), (slice(None), 0.1, False), (slice(192, None), 0.1, False), (slice(None), 30.0, None)],
+    ids=["right", "wrong", "last quarter wrong", "wrong in noise"],
+)
+def test_changing_code_that_compresses_no_echo_is_unconfirmed(wrong, noise, carried):
+    """Before, a wrong seed and a table with too few rows gave an image without a flag; in noise, nothing is decided."""
+    draw, pulses = np.random.default_rng(5), 256
+    numerology = Numerology(1e9, 64e6, np.arange(64), prefix_samples=64, dft_samples=256)
+    sent, configured = (np.exp(0.5j * np.pi * draw.integers(0, 4, (pulses, 64))) for _ in range(2))
+    right = np.ones(pulses, bool)
+    right[wrong] = False
+    configured[right] = sent[right]
+    echo = np.exp(-2j * np.pi * np.arange(64) * 5 / 64)
+    samples = (sent * echo) @ np.exp(2j * np.pi * np.outer(np.arange(64), np.arange(320) - 64) / 256)
+    samples += noise * np.sqrt(32) * draw.normal(size=(pulses, 320, 2)).view(complex)[..., 0]
+    iq = (200 * np.stack([samples.real, samples.imag], -1)).round().astype(np.int16)
+    inverse = (1 / configured).astype(np.complex64)
+    demodulator = Demodulator(lambda captures: inverse[captures], numerology, 320)
+    measured = transfer_by_code(lambda captures: {"radar": iq[captures]}, demodulator, time_s=np.arange(pulses) / 10)
+    assert measured.report["code"]["carried"] is carried
+    assert ("code_unconfirmed" in measured.flags) is (carried is False)
+    if wrong.start:
+        assert "in 4 of 16 parts of the flight" in measured.flags["code_unconfirmed"]
+
+
+def test_echo_of_fewer_than_three_pulses_is_refused(tmp_path):
+    """Before, a code that locks in a single pulse by chance ended in an internal error of a later step."""
+    campaign = Campaign.load(campaign_with(tmp_path / "campaign", "qpsk", FRAMES, pulses=2))
+    for node in "ab":
+        ingest.ingest(campaign, "f01", node)
+    with pytest.raises(CampaignError, match=r"b\.sigmf.*: 2 of 2 common pulses remain; expected at least 3 pulses"):
+        echo.echo(campaign, "f01", "a-b")

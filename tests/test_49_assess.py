@@ -336,3 +336,19 @@ def test_missing_carrier_of_a_recording_is_accepted():
     check_rates(waveform, {"carrier_hz": 0.0, "sample_rate_hz": 5e7}, where="uav1.sigmf-meta")
     with pytest.raises(CampaignError, match="recorded with carrier_hz 1200000000"):
         check_rates(waveform, {"carrier_hz": 1.2e9}, where="uav1.sigmf-meta")
+
+
+@pytest.mark.slow
+def test_hypotheses_of_a_flight_without_a_monostatic_pair_are_tested(tmp_path):
+    """Before, the log of a transmitter that does not receive was not opened: an internal error."""
+
+    def change(root):
+        table = root / "config/flights.tsv"
+        table.write_text(table.read_text().replace("uav1,uav2", "uav2"))
+        edit_track(root, "uav1", delayed(0.5))
+
+    campaign = run_sample(tmp_path, change)
+    assert campaign.flight("f01").images == ("uav1-uav2",)
+    target = json.loads((SHARED / "campaign-sample/truth.json").read_text())["targets"][0]
+    found = hypotheses.hypotheses(campaign, "f01", brightest=(target["x"], target["y"]), cell_m=0.3)
+    assert len(found) <= 1

@@ -206,9 +206,9 @@ _OF_RECORDINGS = {
         "core/echo/captures.py",
     ),
     "code_unconfirmed": Flag(
-        "strongest echo relative to the level beyond the prefix, dB",
-        "echoes repeat from pulse to pulse but do not lie within the prefix or listening time",
-        "waveform.codes, waveform.pulse; another transmitter",
+        "strongest echo relative to the level beyond the prefix, dB; or share of signals that are not compressed",
+        "the code compresses no echo within the prefix or listening time, although the captures contain signals",
+        "waveform.codes (file, number of rows, seed, frame numbers), waveform.pulse; another transmitter",
         "core/echo/own_pulses.py",
     ),
     "phase_unstable": Flag(

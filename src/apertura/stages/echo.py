@@ -17,6 +17,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import save_stage
 from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
@@ -91,6 +92,10 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     return folder
 
 
+_FEWEST_PULSES = 3
+"""Smallest number of pulses of an echo: positions, rates and interference follow from neighbouring pulses."""
+
+
 def pair_echo(
     tx: Acquisition,
     rx: Acquisition,
@@ -130,8 +135,10 @@ def pair_echo(
         basis, channels = f"captures of {decision.source}", decision.variables
         processing = processing.model_copy(update={"sidelink": decision.sidelink_method(processing.sidelink)})
     at = tx.raw.time.values[pulses.tx_index[paired]]
+    _check_number(len(at), pulses, rx)
     measured, sidelink_m = _transfer((tx, rx), (pulses.rx_index[paired], frames), at, sent, processing, air)
     at = at[measured.kept]
+    _check_number(len(at), pulses, rx)
     stated = rx.settings.path_offset_m
     stated_m = stated.radar if tx.name == rx.name else stated.radar - stated.sidelink
     offset_m = calibration["offset_m"] if calibration else stated_m
@@ -174,6 +181,18 @@ def pair_echo(
         lines = _tone_lines(PairEcho.formed(dataset, lambda: (rx, sent, unchanged)))
         dataset = dataset.assign_attrs(tone_lines=lines)
     return PairEcho.formed(dataset, lambda: (rx, sent, processing))
+
+
+def _check_number(used: int, pulses: Association, rx: Acquisition) -> None:
+    """Raise CampaignError if too few pulses remain for an image."""
+    if used < _FEWEST_PULSES:
+        raise CampaignError(
+            f"{used} of {len(pulses.rx_index)} common pulses remain",
+            where=rx.recording,
+            expected=f"at least {_FEWEST_PULSES} pulses with good positions and the transmitted code",
+            remedy="Check waveform.codes (file, seed, constellation, pilots), waveform.iq, and channels, time tags and "
+            "logs of both nodes.",
+        )
 
 
 def _tone_lines(echo: PairEcho) -> list[int]:

@@ -140,7 +140,7 @@ def hypotheses(
     if not isinstance(waveform, SampledWaveform):  # a phase history contains its positions: there are no logs to test
         return []
     sent = transmitted(campaign, waveform)
-    logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).nodes}
+    logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).participants}
     window, track = campaign.settings.processing.window, open_refined(campaign, flight)
     geometries = [
         subset_geometry(logged, pair, PairEcho.cleaned(campaign, flight, pair).stage, window)

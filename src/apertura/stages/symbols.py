@@ -131,9 +131,9 @@ class PairSymbols:
             raise CampaignError(
                 f"the symbols of all {len(usable)} pulses are unsure",
                 where=f"sidelink of {self.source}",
-                expected=f"an SNR of at least {decibels(qam.least_snr):.1f} dB for {qam.name}",
-                remedy="Check antenna, gain and reflections of the sidelink, and waveform.codes. Bistatic pairs do not "
-                "need sure symbols: they are divided by the sidelink.",
+                expected=f"an SNR of at least {decibels(qam.least_snr):.1f} dB for {qam.name}, and reflections that "
+                "change slowly",
+                remedy="Check antenna, gain and reflections of the sidelink, and waveform.codes.",
             )
         return usable
 

@@ -93,7 +93,7 @@ class OpenCampaign:
             kind = "node" if name in _OF_NODES else "pair"
             _check_count(where, 2, name, f"a flight and a {kind}")
             flight = self.campaign.flight(where[0])
-            known = flight.nodes if kind == "node" else flight.pairs
+            known = flight.recorded if kind == "node" else flight.pairs
             _check_name(where[1], kind, known, where=f"campaign.stage({name!r}, {flight.name!r})")
         if name == "echo":
             return PairEcho.cleaned(self.campaign, where[0], where[1]).stage

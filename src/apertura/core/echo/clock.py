@@ -121,7 +121,7 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
             "clock offset not measurable in pulses without repetition (and not required for division by the sidelink)"
         )
     period_s = 1 / numerology.spacing_hz
-    frequency_hz, parts = _repetition(groups, numerology)
+    frequency_hz, parts, _ = _repetition(groups, numerology)
     phase, slope, centre_hz = _phase_and_slope(parts.sum(0), frequency_hz, start=(0.0, 0.0))
     fits = np.array([_phase_and_slope(part, frequency_hz, start=(phase, slope))[:2] for part in parts])
     growth, phase_std = _line(fits[:, 0])
@@ -208,22 +208,52 @@ _INTERFERED = 20.0
 """Power relative to the median, above which a frequency is not used."""
 
 
-def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:
-    """Return the occupied frequencies and, for each group, the cross-spectrum between end and start of the captures."""
-    crosses = [_cross_spectrum(pulses, numerology) for pulses in groups]
-    size = crosses[0].size
+def repeated_share(captures: Complexes, numerology: Numerology) -> float:
+    """Return the share S/(S + N) of repeated signals in the power of captures, (pulse, sample); 0.1 or less in noise.
+
+    Parameters
+    ----------
+    captures
+        At least 64 captures, from the start of the cyclic prefix to the end of the symbol; echoes need no code.
+
+    Raises
+    ------
+    ValueError
+        As `clock_of`.
+
+    Notes
+    -----
+    The share is the median over the frequencies of the coherence between start and end, which excludes tones.
+
+    Examples
+    --------
+    >>> numerology = Numerology(1e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
+    >>> noise = np.random.default_rng(1).normal(size=(100, 120, 2)).astype(np.float32).view(np.complex64)[..., 0]
+    >>> repeated_share(noise, numerology) < 0.2, repeated_share(np.tile(noise[:, :64], 2)[:, :120], numerology) > 0.99
+    (True, True)
+    """
+    _, cross, power = _repetition([captures], numerology)
+    return float(np.median(np.abs(cross[0]) / np.maximum(power[0], np.finfo(float).tiny)))
+
+
+def _repetition(
+    groups: Iterable[Complexes], numerology: Numerology
+) -> tuple[Floats, NDArray[np.complex128], NDArray[np.float64]]:
+    """Return the occupied frequencies, and the cross-spectra and mean power spectra of end and start in each group."""
+    spectra = [_cross_spectrum(pulses, numerology) for pulses in groups]
+    size = spectra[0][0].size
     lowest_hz = numerology.middle_hz - numerology.sample_rate_hz / 2
     frequency_hz = (
         scipy.fft.fftfreq(size, 1 / numerology.sample_rate_hz) - lowest_hz
     ) % numerology.sample_rate_hz + lowest_hz
     occupied = np.abs(frequency_hz - numerology.middle_hz) <= numerology.numbers.size * numerology.spacing_hz / 2
-    parts = np.array(crosses)[:, occupied]
+    parts, power = (np.array(part)[:, occupied] for part in zip(*spectra, strict=True))
     # Interference repeats with another phase. The signal itself has nearly the same power at all frequencies.
     interfered = np.abs(parts) > _INTERFERED * np.median(np.abs(parts), axis=1, keepdims=True)
-    return frequency_hz[occupied], np.where(interfered, 0, parts)
+    return frequency_hz[occupied], np.where(interfered, 0, parts), power
 
 
-def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.complex128]:
+def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
     period, prefix, count = numerology.dft_samples, numerology.prefix_samples, sidelink.shape[1]
     start = prefix if count - period - prefix >= prefix // 2 else prefix // 2
     length = count - period - start
@@ -231,13 +261,14 @@ def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.c
         raise ValueError(f"captures of {count} samples repeat only {length} samples; {_SMALLEST_REPEAT} are required")
     taper = _taper(length)
     size = scipy.fft.next_fast_len(length)
-    cross = np.zeros(size, np.complex128)
+    cross, power = np.zeros(size, np.complex128), np.zeros(size)
     for first in range(0, len(sidelink), AT_ONCE):
         block = sidelink[first : first + AT_ONCE].astype(np.complex128)
         early = scipy.fft.fft(block[:, start : start + length] * taper, size, axis=1)
         late = scipy.fft.fft(block[:, start + period : start + period + length] * taper, size, axis=1)
         cross += (late * early.conj()).sum(0)
-    return cross
+        power += (np.abs(late) ** 2 + np.abs(early) ** 2).sum(0) / 2
+    return cross, power
 
 
 def _taper(length: int) -> Floats:

@@ -309,7 +309,7 @@ def _measure_without_code(blocks: Blocks, path: LineOfSight, where: str) -> Side
             f"the sidelink locks in none of {pulses} pulses",
             where=where,
             expected="the direct path of the transmitter above the noise",
-            remedy="Check antenna, gain and recorded channel of the sidelink.",
+            remedy="Check antenna, gain and recorded channel of the sidelink, and waveform.codes: file, seed, frames.",
         )
     product = float(np.median((common.amplitude**2 / np.maximum(common.noise_power, 1e-30))[common.locked]))
     locked = np.zeros(pulses, bool)

@@ -5,7 +5,7 @@ computes transfer functions from the captures and these numbers, block by block 
 captures is in memory at a time, for any length of the flight.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -29,7 +29,7 @@ from apertura.core.echo.captures import (
     correct_clock,
     spread,
 )
-from apertura.core.echo.clock import GROUPS, clock_of, decide_clock
+from apertura.core.echo.clock import GROUPS, clock_of, decide_clock, repeated_share
 from apertura.core.echo.demodulate import Numerology, demodulate
 from apertura.core.echo.interference import SidelinkInterference, limited
 from apertura.core.echo.line_of_sight import LineOfSight, Weights
@@ -55,6 +55,10 @@ _INVERTED = (
 _COMPRESSED = 4.0
 
 _STRETCH = 128  # number of consecutive pulses in each part of the flight in which code and phase are checked
+_FEWEST_TESTED = 8  # minimum number of pulses of a part of the flight in which the code is checked
+_SIGNAL_SHARE = 0.8
+"""Share of signals in the power of captures, above which the right code compresses an echo: a signal that fills the
+cyclic prefix is then at least 10 dB above the level beyond it."""
 _CLOCK_STRETCH = 256  # number of consecutive pulses in each part of the flight in which the clock is measured
 
 
@@ -230,9 +234,13 @@ def transfer_by_code(
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
     """
     numerology, saturation = demodulator.numerology, Saturation()
-    checked = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
+    groups = spread(len(time_s), groups=GROUPS, each=_STRETCH)
+    checked = np.concatenate(groups)
     sample = np.concatenate([demodulator.transfer(read(block), block) for block in blocks_of(checked)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
+    if code.carried is not False and len(demodulator.inverse(checked)) > 1:
+        parts = np.split(sample, np.cumsum([len(group) for group in groups])[:-1])
+        code = _code_of_parts(code, read, demodulator, list(zip(groups, parts, strict=True)))
     inverted: Mapping[str, str] = {}
     if not code.carried:
         conjugate = [
@@ -253,6 +261,34 @@ def transfer_by_code(
         return formed(captures, None)
 
     return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
+
+
+def _code_of_parts(
+    code: CodeEvidence, read: Read, demodulator: Demodulator, parts: Sequence[tuple[Pulses, Complexes]]
+) -> CodeEvidence:
+    """Return evidence against changing codes, if parts of the flight contain signals that the code does not compress.
+
+    `parts`: captures, and their transfer functions. Of changing codes, wrong ones leave no signal that is common to all
+    pulses; that captures contain a signal is measured on the repeated samples of the symbol.
+    """
+    numerology, wrong, tested = demodulator.numerology, [], 0
+    for captures, transfer in parts:
+        samples = as_complex(read(captures)["radar"][:, : demodulator.symbol_samples])
+        try:
+            share = repeated_share(samples, numerology)
+        except ValueError:  # the signal has no repetition, or captures are too short
+            return code
+        if len(captures) >= _FEWEST_TESTED and share > _SIGNAL_SHARE:
+            tested += 1
+            if not own_code(transfer, prefix_cells=numerology.delay_cells).carried:
+                wrong.append(share)
+    if not wrong:
+        return code
+    line = (
+        f"in {len(wrong)} of {tested} parts of the flight, {100 * min(wrong):.0f} % of the power is that of signals, "
+        "but the code compresses no echo: other symbols were transmitted"
+    )
+    return CodeEvidence(False, line)
 
 
 def transfer_by_sidelink(
