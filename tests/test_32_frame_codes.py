@@ -190,7 +190,7 @@ def test_wrong_tables_are_refused(tmp_path):
     for name, table in {"shape": codes[:, :-1], "zero": codes * 0, "nan": codes * np.nan, "real": codes.real}.items():
         np.save(tmp_path / f"{name}.npy", table)
         assert f"{name}.npy" in complaint(lambda name=name: CodeTable(tmp_path / f"{name}.npy", SUBCARRIERS))
-    late = np.ones((100, SUBCARRIERS), np.complex64)
+    late = np.ones((1 << 15, SUBCARRIERS), np.complex64)  # a large table is tested when its rows are read
     late[51, 3] = 0
     np.save(tmp_path / "late.npy", late)
     table = CodeTable(tmp_path / "late.npy", SUBCARRIERS)
@@ -388,3 +388,12 @@ def test_echo_of_fewer_than_three_pulses_is_refused(tmp_path):
         ingest.ingest(campaign, "f01", node)
     with pytest.raises(CampaignError, match=r"b\.sigmf.*: 2 of 2 common pulses remain; expected at least 3 pulses"):
         echo.echo(campaign, "f01", "a-b")
+
+
+def test_any_row_of_a_table_that_is_not_finite_is_found_when_it_is_opened(tmp_path):
+    """Before, 16 rows were tested: `check` reported no problem, and the run ended with an error."""
+    codes = np.ones((200, SUBCARRIERS), np.complex64)
+    codes[101, 7] = np.nan
+    np.save(tmp_path / "codes.npy", codes)
+    message = complaint(lambda: CodeTable(tmp_path / "codes.npy", SUBCARRIERS))
+    assert "of shape (200, 64), of which 0 are zero and 1 not finite" in message

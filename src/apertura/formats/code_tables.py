@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 MOST_SYMBOLS = 1 << 24
 """Largest number of code symbols of a frame, and of a chunk of a Zarr array."""
 
+_TESTED_SYMBOLS = 1 << 20  # number of code symbols up to which all rows are tested when a table is opened; else 16 rows
+
 
 class CodeTable:
     """Table of code symbols in a file, of which only the requested rows are read.
@@ -51,7 +53,8 @@ class CodeTable:
         self.shape = (1, *self._array.shape)[-2:]
         if self._array.ndim not in {1, 2} or self.shape[1] != subcarriers or not self.shape[0]:
             raise self._refused("")
-        self[np.unique(np.linspace(0, self.shape[0] - 1, 16).astype(np.int64))]
+        tested = self.shape[0] if self.shape[0] * subcarriers <= _TESTED_SYMBOLS else 16
+        self[np.unique(np.linspace(0, self.shape[0] - 1, tested).astype(np.int64))]
 
     def __getitem__(self, rows: NDArray[np.int64]) -> NDArray[np.complex64]:
         """Return the rows of the given numbers, (row, subcarrier) complex64."""
