@@ -158,12 +158,12 @@ def test_weighted_image_uses_cuda_only_if_requested(monkeypatch):
         assert plan(overrides=requested, **job).engine == "cuda"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("threads", "engine"), [(1, "cuda"), (64, "tree")])
 def test_device_is_selected_where_it_is_faster_than_all_threads(monkeypatch, threads, engine):
     """All threads share the device, so that its time is compared with that of a CPU with this number of cores."""
     monkeypatch.setattr(cuda, "available", lambda: True)
-    assert plan(shape=(4000, 4000), threads=threads).engine == engine
+    large = planning_job(shape=(20000, 20000), tile_px=1024, threads=threads)
+    assert SettingSearch(large).cheapest(300, -63.0).engine == engine
     assert plan(threads=threads).engine != "cuda"  # the first kernel takes longer to start than a small image
     requested = plan(overrides={"engine_options": {"cuda": {"oversampling": 8}}}, threads=threads)
     assert requested.engine == "cuda"
