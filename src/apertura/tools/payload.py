@@ -193,7 +193,7 @@ def _summary(columns: Mapping[str, NDArray[Any]], unknown: UnknownSymbols, prf_h
     count = FrameCount.of(columns["counter"], columns["intact"], time_s, prf_hz=prf_hz, bits=frames.counter_bits)
     received, rate_bit_s = min(counts["intact"] / count.sent, 1.0), frames.data_bits * prf_hz
     remarks = list[str]()
-    if count.steps and not np.ptp(columns["counter"][columns["intact"]]):
+    if count.steps > count.agreeing == 0 and not np.ptp(columns["counter"][columns["intact"]]):
         remarks.append(f"the counter is {columns['counter'][columns['intact']][0]} in all intact frames.")
     elif count.agreeing < count.steps:
         remarks.append(
@@ -242,7 +242,8 @@ def draw_payload(path: Path, read: Sequence[NodePayload], *, title: str, tags: M
             # lost frames may have no SNR: marks at a constant height above the time axis
             marked = time_s[lost[thinned(len(lost))]] if len(lost) else lost
             height = np.full(len(marked), 0.04 + 0.05 * number)
-            label = f"{node}: {one.summary['lost']} of {one.summary['sent']} frames lost"
+            unrecorded = max(one.summary["sent"] - len(time_s), 0)
+            label = f"{node}: {len(lost)} frames not intact, {unrecorded} not recorded"
             snr.plot(marked, height, "x", ms=4, color=colour, label=label, transform=snr.get_xaxis_transform())
         least_db, most_db = decibels(qam.least_snr), 2 * decibels(qam.decided(qam.least_snr).evm)
         snr.axhline(least_db, color="0.4", ls="--", label=f"least SNR of {qam.name}: {least_db:.1f} dB")

@@ -185,4 +185,4 @@ class FrameCount:
             return cls(by_time, steps, agreeing, advance)
         drift = np.concatenate([[0], deviation.cumsum()])
         change = round(float(np.median(drift[-_AT_ENDS:]) - np.median(drift[:_AT_ENDS])))
-        return cls(by_time + change, steps, agreeing, advance)
+        return cls(max(by_time + change, 1), steps, agreeing, advance)
