@@ -5,7 +5,7 @@ import pytest
 from own_campaign import crc16, frame
 
 from apertura.core.echo.constellation import constellation
-from apertura.core.echo.frame_format import FrameFormat
+from apertura.core.echo.frame_format import FrameCount, FrameFormat
 
 HEADER = np.unpackbits(np.frombuffer(bytes.fromhex("1acffc1d"), np.uint8))
 
@@ -39,7 +39,7 @@ def test_frames_of_other_code_are_parsed():
 
 @pytest.mark.parametrize("snr_db", [9.0, 11.0])
 def test_frame_errors_follow_from_the_symbol_error_rate(snr_db):
-    """Eq. 15: frames of 128 QPSK symbols, within four standard deviations."""
+    """Eq. 16: frames of 128 QPSK symbols, within four standard deviations."""
     qam, random, count, symbols = constellation("qpsk"), np.random.default_rng(4), 3000, 128
     frames = FrameFormat(HEADER, 16, True, symbols * qam.bits_per_symbol)
     bits = frames.bits(np.arange(count), random.integers(0, 2, (count, frames.data_bits), np.uint8))
@@ -47,3 +47,36 @@ def test_frame_errors_follow_from_the_symbol_error_rate(snr_db):
     received = frames.parsed(qam.bits(qam.decide(qam.symbols(bits) + noise)))
     expected = 1 - (1 - float(qam.symbol_error_rate(10 ** (snr_db / 10)))) ** symbols
     assert np.mean(~received.intact) == pytest.approx(expected, abs=4 * np.sqrt(expected / count))
+
+
+def recorded(kept, *, bits=4, count=60, prf_hz=20.0):
+    """Return counter, intact and time tags of the recorded ones of `count` frames, with time jitter."""
+    number, jitter_s = np.arange(count)[kept], np.random.default_rng(2).uniform(-0.01, 0.01, count)[kept]
+    return (number + 5) % (1 << bits), np.ones(number.size, bool), number / prf_hz + jitter_s
+
+
+def test_sent_frames_are_counted_across_gaps_longer_than_the_period_of_the_counter():
+    """Eq. 17: of 60 frames with a counter of 4 bits, 25 in a row are missing."""
+    counter, intact, time_s = recorded(np.r_[0:20, 45:60])
+    count = FrameCount.of(counter, intact, time_s, prf_hz=20.0, bits=4)
+    assert (count.sent, count.steps, count.agreeing) == (60, 34, 34)
+    counter[3], intact[7] = 1, False  # a wrong counter disagrees in the steps before and after it
+    count = FrameCount.of(counter, intact, time_s, prf_hz=20.0, bits=4)
+    assert (count.sent, count.steps, count.agreeing) == (60, 33, 31)
+
+
+def test_frames_that_the_transmitter_omitted_are_not_sent():
+    """The counter stands still for 10 intervals in which nothing is sent: 50 frames in 60 intervals."""
+    counter, intact, time_s = recorded(np.r_[0:20, 30:60], bits=8)
+    counter[20:] -= 10
+    count = FrameCount.of(counter, intact, time_s, prf_hz=20.0, bits=8)
+    assert (count.sent, count.steps, count.agreeing) == (50, 49, 48)
+
+
+def test_counter_of_the_wrong_length_does_not_count_frames():
+    """8 data bits behind a counter of 16 bits: the number advances by 256 on average; time tags count the frames."""
+    counter, intact, time_s = recorded(slice(None), bits=16)
+    counter = 256 * counter + np.random.default_rng(3).integers(0, 256, counter.size)
+    count = FrameCount.of(counter, intact, time_s, prf_hz=20.0, bits=24)
+    assert (count.sent, count.agreeing) == (60, 0)
+    assert count.advance == pytest.approx(256, abs=64)

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.core.echo.constellation import CONSTELLATIONS, Constellation, constellation
+from apertura.core.echo.decided_symbols import DecisionCheck, SidelinkSymbols
+from apertura.core.echo.demodulate import Numerology
+from apertura.core.echo.frame_format import FrameFormat
 from apertura.core.echo.unknown_symbols import Decisions, Pilots, SymbolDecider
 
 N, GROUP = 1024, 64
@@ -210,7 +213,7 @@ def test_pilots_estimate_the_channel_below_the_snr_of_a_blind_estimate() -> None
     errors = float(np.mean(decisions.labels[:, data] != sidelink.sent[:, data]))
     assert errors == pytest.approx(sidelink.error_rate(qam, 0), abs=0.03)
     assert np.array_equal(decisions.symbols[:, pilots.places], np.broadcast_to(pilots.symbols, (GROUP, 128)))
-    with pytest.raises(CampaignError, match="no direct path"):
+    with pytest.raises(CampaignError, match=r"no direct path.*pilots of waveform\.codes, waveform\.iq"):
         Sidelink(qam, -3).decider(qam)
 
 
@@ -223,3 +226,87 @@ def test_irregular_pilots_are_refused(spoil: Any) -> None:
     spoil(table)
     with pytest.raises(CampaignError, match="pilots at distances of"):
         Pilots.of(table, "pilots.npy")
+
+
+def pilot_comb(step: int = 8) -> Pilots:
+    """Return QPSK pilots at every `step`-th subcarrier."""
+    table = np.zeros(N, np.complex64)
+    table[::step] = np.exp(2j * np.pi * (np.random.default_rng(5).integers(0, 4, N // step) + 0.5) / 4)
+    return Pilots.of(table, "pilots.npy")
+
+
+def checked(sidelink: Sidelink, decider: SymbolDecider, frames: FrameFormat | None = None) -> DecisionCheck:
+    """Return the check of the decisions of all pulses."""
+    numerology = Numerology(1e9, 64e6, np.arange(N), prefix_samples=0, dft_samples=N)
+    symbols = SidelinkSymbols(lambda _: {}, numerology, N, decider, None, 0.0, frames)
+    check, decisions = DecisionCheck(symbols), decider.decide(sidelink.received, sidelink.numbers)
+    if frames is not None and decider.pilots is None:
+        decisions = decider.resolved(decisions, frames.known_labels(decider.constellation))
+    check.add(decisions)
+    return check
+
+
+@pytest.mark.parametrize("name", CONSTELLATIONS)
+def test_random_data_raise_no_flag_of_the_occupancy(name: str) -> None:
+    """New data in each pulse, 0.5 dB above the least SNR and without noise, and the same data in all pulses."""
+    qam = constellation(name)
+    for snr_db in (10 * np.log10(qam.least_snr) + 0.5, 60.0):
+        sidelink = Sidelink(qam, snr_db)
+        assert checked(sidelink, sidelink.decider(qam)).flags == {}
+    sidelink.received[:] = sidelink.received[:1]
+    assert checked(sidelink, sidelink.decider(qam)).flags == {}
+
+
+@pytest.mark.parametrize(
+    ("sent", "configured", "snr_db", "mean_power"),
+    # QPSK: corners of 16-QAM, (1 + 1)·9/10; 16-QAM: levels ±3 and ±7 of 64-QAM, 2·(9 + 49)/2·3/126
+    [("qpsk", "16qam", 25.0, 9 / 5), ("16qam", "64qam", 45.0, 29 / 21)],
+)
+def test_another_constellation_is_found_by_the_points_that_its_symbols_do_not_occupy(
+    sent: str, configured: str, snr_db: float, mean_power: float
+) -> None:
+    """Eq. 18: with pilots, all pulses are sure, and images would lose the mean power of the decided symbols."""
+    pilots = pilot_comb()
+    sidelink = Sidelink(constellation(sent), snr_db, pilots=pilots)
+    check = checked(sidelink, sidelink.decider(constellation(configured), pilots))
+    assert check.pulses == GROUP
+    assert check.flags.keys() == {"constellation_suspect"}
+    line = check.flags["constellation_suspect"]
+    assert f"as by {sent}; mean power of the decided symbols {10 * np.log10(mean_power):+.1f} dB" in line
+    right = checked(sidelink, sidelink.decider(constellation(sent), pilots))
+    assert right.flags == {}
+
+
+def test_data_that_are_not_scrambled_are_found_by_their_occupancy() -> None:
+    """Capital letters in ASCII: bits 010 or 100 and 101 begin each byte, so that 16-QAM uses few of its points."""
+    qam, pilots = constellation("16qam"), pilot_comb()
+    sidelink = Sidelink(qam, 60.0, pilots=pilots)
+    letters = np.random.default_rng(1).integers(ord("A"), ord("Z") + 1, (GROUP, N // 2), np.uint8)
+    labels = qam.labels(np.unpackbits(letters, axis=1))
+    turn = sidelink.received / sidelink.symbols
+    sidelink.symbols = qam.points[labels]
+    sidelink.symbols[:, pilots.places] = pilots.symbols
+    sidelink.received = turn * sidelink.symbols
+    check = checked(sidelink, sidelink.decider(qam, pilots))
+    assert check.flags.keys() == {"constellation_suspect"}
+
+
+@pytest.mark.parametrize("name", ["qpsk", "64qam"])
+@pytest.mark.parametrize(("excess_db", "wrong_bits"), [(0.5, 0), (0.5, 4), (8.0, 0), (8.0, 1)])
+def test_header_differs_if_a_bit_is_wrong_in_all_frames(name: str, excess_db: float, wrong_bits: int) -> None:
+    """Eq. 19: errors of a header of 32 bits by noise raise no flag; 4 wrong bits do, and above the least SNR, one."""
+    qam, pilots = constellation(name), pilot_comb()
+    header = np.unpackbits(np.frombuffer(bytes.fromhex("1acffc1d"), np.uint8))
+    sidelink = Sidelink(qam, 300.0, pilots=pilots, pulses=256)
+    data = np.setdiff1d(np.arange(N), np.arange(N)[pilots.places])
+    framed = qam.bits(sidelink.sent[:, data])
+    framed[:, :32] = header
+    framed[:, 5 : 5 + wrong_bits] ^= 1
+    sidelink.received[:, data] *= qam.symbols(framed) / qam.points[sidelink.sent[:, data]]
+    level = 5 * np.sqrt(0.5 / (qam.least_snr * 10 ** (excess_db / 10)))
+    sidelink.received += level * np.random.default_rng(6).normal(size=(256, N, 2)) @ [1, 1j]
+    frames = FrameFormat(header, 16, True, data.size * qam.bits_per_symbol)
+    check = checked(sidelink, sidelink.decider(qam, pilots), frames)
+    assert ("header_differs" in check.flags) == bool(wrong_bits)
+    if not wrong_bits:
+        assert check.expected_bits == pytest.approx(check.wrong_bits, rel=0.2, abs=3)

@@ -1,5 +1,6 @@
 """Bench measurement of a radar: a correct set-up raises no flag, and each defect raises its own flag."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -263,3 +264,26 @@ def test_image_without_aperture_is_inconclusive_about_focus():
     assert focus.reason.startswith("no aperture: the antennas moved by 0 m, which yields no resolution")
     assert "no_aperture" in image.attrs["flags"]
     assert not focus.flags.keys() & {"defocused", "echo_outside_scene"}
+
+
+@pytest.mark.slow
+def test_line_of_data_symbols_counts_the_recorded_pulses(tmp_path):
+    """Pulses that the receiver did not record carry no symbols: before, "286 of 295" was within "all pulses"."""
+    bench = measured(carrying(SPOILT["triggers missed"]), tmp_path / "bench")
+    lines = [line for line in bench.lines if line.what == "data symbols"]
+    assert {line.limit for line in lines} == {"decided in all recorded pulses"}
+    for line in lines:
+        decided, recorded = re.search(r"decided in (\d+) of (\d+) pulses recorded by uav2", line.measured).groups()
+        assert (decided == recorded) == (line.flags == ())
+    missed = next(node for node in bench.nodes if node.name == "uav1").triggers
+    assert int(recorded) <= missed.recorded
+
+
+@pytest.mark.slow
+def test_wrong_header_of_data_symbols_is_flagged_on_the_bench(tmp_path):
+    """The links are right, but the frames are not those of the config."""
+    root = carrying(RIGHT).write(tmp_path / "bench", 3)
+    edit_config(root, lambda config: config["waveform"]["codes"]["frame"].update(header="1acffc1e"))
+    bench = measure_bench(Campaign.load(root), FLIGHT)
+    assert bench.flags.keys() == {"header_differs"}
+    assert all("header_differs" in line.flags for line in bench.lines if line.what == "data symbols")

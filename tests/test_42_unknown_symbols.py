@@ -309,3 +309,78 @@ def test_wrong_settings_of_unknown_symbols_are_refused(tmp_path, codes, found):
     with pytest.raises(CampaignError) as caught:
         formed(tmp_path / "campaign", "uav1-uav1")
     assert found in caught.value.found
+
+
+def printed(campaign, capsys):
+    """Return the summary of the only node in payload.json, and the printed text in one line."""
+    print_payload(campaign)
+    (summary,) = json.loads(campaign.result("f01", "payload", "payload.json").read_text())["nodes"]
+    return summary, " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.slow
+def test_header_that_is_not_sent_is_flagged_and_stated(tmp_path, capsys):
+    """Two of 32 bits differ: before, the payload was 0 intact frames without a remark, and the echo had no flag."""
+    root = tmp_path / "campaign"
+    own_campaign.write(root, pulses=64, sidelink_db=25.0)
+    assert formed(root)[1].stage.attrs["flags"] == {}
+    edit_config(root, lambda config: config["waveform"]["codes"].update(frame={"header": "1acffc1e"}))
+    campaign, pair = formed(root)
+    line = "6.2 % of the bits of the header are wrong, 0.00 % expected from the SNR"
+    assert pair.stage.attrs["flags"] == {"header_differs": f"sidelink of uav2: {line}"}
+    summary, text = printed(campaign, capsys)
+    assert (summary["intact"], summary["lost"]) == (0, 64)
+    assert summary["remarks"][0].startswith(line)
+    assert f"f01, uav2: {line}" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", PAIRS)
+def test_header_in_the_conjugated_samples_names_the_order_of_i_and_q(tmp_path, capsys, pair):
+    """The conjugate of a band around the carrier is a band of QAM symbols too: only the header tells them apart."""
+    plan = preset("payload", pulses=96)
+    plan = replace(plan, waveform=replace(plan.waveform, carrier_is="band_centre"))
+    root = simulate(tmp_path / "campaign", plan)
+    edit_config(root, lambda config: config["nodes"]["uav2"].update(iq="conjugate"))
+    campaign, echoes = formed(root, pair)
+    flags = echoes.stage.attrs["flags"]
+    assert {"header_differs", "spectrum_inverted"} <= flags.keys()
+    assert "sidelink of uav2: the complex conjugates of the samples contain the header" in flags["spectrum_inverted"]
+    assert "change nodes.uav2.iq, or waveform.iq" in printed(campaign, capsys)[1]
+    edit_config(root, lambda config: config["nodes"]["uav2"].update(iq="complex"))
+    assert not formed(root, pair)[1].stage.attrs["flags"].keys() & {"header_differs", "spectrum_inverted"}
+
+
+@pytest.mark.slow
+def test_frames_without_capture_are_lost(tmp_path, capsys):
+    """Of 100 sent frames, 90 are recorded between the first and the last: before, the frame error rate was 0."""
+    root = tmp_path / "campaign"
+    own_campaign.write(root, constellation="qpsk", pulses=100, sidelink_db=25.0)
+    path = root / "raw" / "f01" / "uav2.sigmf-meta"
+    described = json.loads(path.read_text())
+    described["captures"] = [one for m, one in enumerate(described["captures"]) if not (20 <= m < 28 or m in (50, 70))]
+    path.write_text(json.dumps(described))
+    summary, _ = printed(Campaign.load(root), capsys)
+    assert (summary["frames"], summary["intact"], summary["sent"], summary["lost"]) == (90, 90, 100, 10)
+    assert summary["frame_error_rate"] == pytest.approx(0.1)
+    assert summary["received_bit_s"] == pytest.approx(0.9 * summary["sent_bit_s"])
+    assert summary["remarks"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("frame", "intact", "remark"),
+    [
+        ({"counter_bits": 24}, 64, "agrees with time tags and prf_hz in 0 of 63 steps"),
+        ({"counter_bits": 8}, 64, "the counter is 0 in all intact frames"),
+        ({"header": "1acffc1d00"}, 0, "no frame is intact, of 64.0 expected from the SNR"),
+    ],
+)
+def test_wrong_fields_of_a_frame_are_stated(tmp_path, capsys, frame, intact, remark):
+    """Before, frames with a wrong length of the counter were intact without a remark, as the check sum covers both."""
+    root = tmp_path / "campaign"
+    own_campaign.write(root, constellation="qpsk", pulses=64, sidelink_db=25.0)
+    edit_config(root, lambda config: config["waveform"]["codes"].update(frame={"header": "1acffc1d", **frame}))
+    summary, text = printed(Campaign.load(root), capsys)
+    assert (summary["intact"], summary["sent"]) == (intact, 64)
+    assert remark in text

@@ -248,6 +248,20 @@ _OF_RECORDINGS = {
         "SNR and reflections of the sidelink; waveform.codes: constellation, pilots",
         "core/echo/decided_symbols.py",
     ),
+    "constellation_suspect": Flag(
+        "constellation with such an occupancy; mean power of the decided symbols, dB",
+        "the decided data symbols do not occupy the points of the configured constellation uniformly: another "
+        "constellation was sent, which changes the amplitude of images, or the data are not scrambled, which does not",
+        "waveform.codes.constellation; scrambling of the data",
+        "core/echo/decided_symbols.py",
+    ),
+    "header_differs": Flag(
+        "wrong bits of the header, and number expected from the SNR, %",
+        "the decided symbols do not begin with the configured header: decisions or configuration are wrong, or frames "
+        "of another transmitter were received",
+        "waveform.codes: constellation, pilots, frame.header; waveform.iq, nodes.<n>.iq; another transmitter",
+        "core/echo/decided_symbols.py",
+    ),
     "sidelink_spikes": Flag(
         "pulses whose sidelink phase deviates, rad and cm; pulses excluded; loss by the others, dB",
         "the sidelink is disturbed in individual pulses; the echoes of these pulses are not affected",

@@ -1,7 +1,7 @@
 """Recording of one node in a flight: samples per channel and antenna positions per pulse, on a common time scale."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +101,11 @@ class Captured:
     numerology: Numerology
     order: str
     frames: FrameNumbers
+
+    @property
+    def conjugated(self) -> "Captured":
+        """The recording, of which the complex conjugates of the samples are read."""
+        return replace(self, order="conjugate" if self.order == "complex" else "complex")
 
     def reader(self, channels: Sequence[str], pulses: NDArray[np.int64]) -> Read:
         """Return a function that reads channels of selected captures from the recorder's file, block by block.

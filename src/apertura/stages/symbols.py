@@ -1,6 +1,6 @@
 """Symbols of a pair's pulses that are decided from a sidelink, in place of symbols known beforehand."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -9,14 +9,18 @@ from numpy.typing import NDArray
 
 from apertura.campaign.config import CONFIG
 from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
 from apertura.common.units import decibels
-from apertura.core.echo.captures import blocks_of
-from apertura.core.echo.decided_symbols import SidelinkSymbols
+from apertura.core.echo.captures import blocks_of, spread
+from apertura.core.echo.decided_symbols import DecisionCheck, SidelinkSymbols
 from apertura.core.echo.frame_codes import Inverses
 from apertura.core.echo.unknown_symbols import SymbolDecider
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.stages.acquisition import Captured, common_pulses
 from apertura.stages.transmitted import Transmitted
+
+FEW_ERRORS = 0.1
+"""Fraction of wrong bits in the header below which the order of I and Q is confirmed."""
 
 
 def decided_symbols(
@@ -39,12 +43,12 @@ def decided_symbols(
     unknown = sent.unknown
     if unknown is None:
         raise TypeError("the symbols are known")
-    count, frames = len(source.raw.start), unknown.frames
+    count = len(source.raw.start)
     recorded: dict[str, Any] = {
         "read": source.reader(["sidelink"], np.arange(count)),
         "numerology": source.numerology,
         "symbol_samples": sent.waveform.capture_samples,
-        "known": None if frames is None else frames.known_labels(unknown.constellation),
+        "frames": unknown.frames,
     }
     if stage is not None:
         shapes, middles = stage.symbol_channel.values, stage.symbol_group.values
@@ -64,7 +68,25 @@ def decided_symbols(
     )
 
 
-@dataclass(frozen=True, eq=False)
+def check_flags(check: DecisionCheck, source: Captured, sent: Transmitted, accuracy_db: Any) -> dict[str, str]:
+    """Return the flags of decided symbols of a node, and a flag if the header is that of the conjugated samples."""
+    name, flags = source.files.name, check.flags
+    if check.header_differs:
+        try:
+            other = decided_symbols(source.conjugated, sent, accuracy_db)
+        except CampaignError:
+            pass
+        else:
+            tested = np.concatenate(spread(len(source.raw.start), groups=4, each=16))
+            if other.header_error_rate(tested) < FEW_ERRORS:
+                flags["spectrum_inverted"] = (
+                    f"the complex conjugates of the samples contain the header; change nodes.{name}.iq, or waveform.iq "
+                    "if all nodes are affected"
+                )
+    return flags
+
+
+@dataclass(eq=False)
 class PairSymbols:
     """Symbols of the pulses of a pair.
 
@@ -74,17 +96,21 @@ class PairSymbols:
         Transmitted signal whose rows are the captures of the source.
     rows
         (pulse,) int64, row of each pulse; -1 if the source did not record it.
-    symbols, source
-        Symbols of the source, and its name.
+    symbols, recorded, accuracy_db
+        Symbols and recording of the source, and `processing.accuracy_db`.
     is_monostatic
         True if the pulses are those of a monostatic pair, whose echo cannot be divided by the sidelink of the source.
+    check
+        Check of the sure symbols, set by `usable`; None before.
     """
 
     sent: Transmitted
     rows: NDArray[np.int64]
     symbols: SidelinkSymbols
-    source: str
+    recorded: Captured
+    accuracy_db: float | Literal["auto"]
     is_monostatic: bool
+    check: DecisionCheck | None = field(default=None, init=False)
 
     @classmethod
     def of(
@@ -112,7 +138,7 @@ class PairSymbols:
                 remedy="Set waveform.codes.node to a node with a sidelink, or name the channel in apertura:channels.",
             )
         symbols = decided_symbols(source, sent, accuracy_db)
-        return cls(with_symbols(sent, source, symbols), rows, symbols, name, is_monostatic)
+        return cls(with_symbols(sent, source, symbols), rows, symbols, source, accuracy_db, is_monostatic)
 
     def usable(self) -> NDArray[np.bool_]:
         """Return True for pulses whose symbols are used; all pulses are decided, block by block.
@@ -122,10 +148,12 @@ class PairSymbols:
         CampaignError
             If no pulse is used.
         """
-        usable = np.zeros(len(self.rows), bool)
+        usable, check = np.zeros(len(self.rows), bool), DecisionCheck(self.symbols)
         for block in blocks_of(np.flatnonzero(self.rows >= 0)):
             decisions = self.symbols.decisions(self.rows[block])
             usable[block] = self.symbols.usable(decisions, divided=self._divided)
+            check.add(decisions)
+        self.check = check
         if not usable.any():
             qam = self.symbols.decider.constellation
             raise CampaignError(
@@ -136,15 +164,6 @@ class PairSymbols:
                 remedy="Check antenna, gain and reflections of the sidelink, and waveform.codes.",
             )
         return usable
-
-    def header_errors(self, captures: NDArray[np.int64]) -> float:
-        """Return the fraction of wrong bits in the headers of captures of the source; 0 without a frame format."""
-        unknown = self.sent.unknown
-        if unknown is None or unknown.frames is None:
-            return 0.0
-        labels = self.symbols.decisions(captures).labels[:, self.symbols.decider.data_places]
-        frames = unknown.frames.parsed(unknown.constellation.bits(labels))
-        return float(frames.header_errors.mean() / unknown.frames.header.size)
 
     def sidelink_method(self, requested: str) -> str:
         """Return the sidelink correction; of `auto`, division if symbols are unsure, else the one with least noise."""
@@ -158,8 +177,17 @@ class PairSymbols:
         return {"node": self.source, **stated, "sfo_ppm": self.symbols.sfo_ppm}
 
     def flags(self, usable: NDArray[np.bool_]) -> dict[str, str]:
-        """Return a flag if pulses that the source recorded are unsure; `usable`: pulses that are used."""
-        return self.symbols.flags(usable[self.rows >= 0], divided=self._divided)
+        """Return the flags of unsure pulses of the source, and of the check of sure ones; `usable`: used pulses."""
+        checked = dict[str, str]()
+        if self.check is not None and not self._divided:
+            raised = check_flags(self.check, self.recorded, self.sent, self.accuracy_db)
+            checked = {flag: f"sidelink of {self.source}: {line}" for flag, line in raised.items()}
+        return Flags.merged(checked, self.symbols.flags(usable[self.rows >= 0], divided=self._divided))
+
+    @property
+    def source(self) -> str:
+        """Name of the node whose sidelink contains the symbols."""
+        return self.recorded.files.name
 
     @property
     def _divided(self) -> bool:

@@ -15,14 +15,17 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_listed, record_files
 from apertura.common.atomic import replacement, write_json
 from apertura.common.errors import CampaignError
+from apertura.common.flag_table import FLAGS
 from apertura.common.provenance import Provenance
 from apertura.common.tables import write_table
 from apertura.common.units import decibels, seconds_since
 from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.constellation import constellation
+from apertura.core.echo.decided_symbols import DecisionCheck
+from apertura.core.echo.frame_format import FrameCount
 from apertura.stages.acquisition import Captured
 from apertura.stages.ingest import captures_of, checked_recording
-from apertura.stages.symbols import decided_symbols
+from apertura.stages.symbols import check_flags, decided_symbols
 from apertura.stages.tags import tags_of
 from apertura.stages.transmitted import Transmitted, UnknownSymbols, transmitted
 from apertura.views.quality import PAYLOAD, payload_row
@@ -31,6 +34,7 @@ from apertura.workflow.lineage import result_of
 from apertura.workflow.rule_inputs import JobScope, Scope, has_frames
 from apertura.workflow.stale import outdated_places
 
+_FEWEST_INTACT = 16.0  # expected number of intact frames, of which none is intact with a probability of 10⁻⁷
 _COLOURS = (BLUE, ORANGE, GREEN, RED, SKY)
 
 
@@ -47,7 +51,8 @@ class NodePayload:
     data
         (frame, byte) uint8, data bits of each frame, padded with zeros to whole bytes.
     summary
-        Name of the node, numbers of frames and errors, medians of SNR and EVM, and data rates.
+        Name of the node, numbers of frames and errors, medians of SNR and EVM, data rates, and remarks on frames that
+        do not have the configured format.
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -104,14 +109,18 @@ def print_payload(campaign: Campaign) -> list[Path]:
         )
     for where in outdated_places(campaign, "payload"):
         payload(campaign, *where)
-    table, files = Table("flight", *PAYLOAD), list[Path]()
+    table, files, remarks = Table("flight", *PAYLOAD), list[Path](), list[str]()
     for flight in campaign.flights:
         folder = campaign.result(flight.name, "payload")
         report = open_listed(folder / "payload.json", folder / "payload.manifest.json")
         for summary in report["nodes"]:
             table.add_row(flight.name, *payload_row(summary))
+            remarks += [f"{flight.name}, {summary['node']}: {remark}" for remark in summary["remarks"]]
         files += [folder / "payload.json", folder / "payload.png"]
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    for remark in remarks:
+        console.print(remark, markup=False, highlight=False)
     return files
 
 
@@ -150,10 +159,11 @@ def _payload(captured: Captured, sent: Transmitted, accuracy_db: Any, node: str)
     if unknown is None or unknown.frames is None:
         raise TypeError("the waveform has no frame format")
     symbols, parts, data = decided_symbols(captured, sent, accuracy_db), list[dict[str, NDArray[Any]]](), []
+    check = DecisionCheck(symbols)
     for block in blocks_of(np.arange(len(captured.raw.start))):
         decisions = symbols.decisions(block)
-        bits = unknown.constellation.bits(decisions.labels[:, symbols.decider.data_places])
-        frames, detected = unknown.frames.parsed(bits), decisions.path.locked
+        frames, detected = symbols.parsed(decisions), decisions.path.locked
+        check.add(decisions)
         data.append(np.packbits(frames.data, axis=1))
         parts.append({
             "detected": detected,
@@ -165,17 +175,31 @@ def _payload(captured: Captured, sent: Transmitted, accuracy_db: Any, node: str)
             "intact": frames.intact & detected,
         })  # fmt: skip
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    summary = {"node": node, **_summary(columns, unknown, sent.waveform.prf_hz)}
-    return NodePayload({"time": captured.raw.time.values, **columns}, np.concatenate(data), summary)
+    columns = {"time": captured.raw.time.values, **columns}
+    summary = _summary(columns, unknown, sent.waveform.prf_hz)
+    flags = check_flags(check, captured, sent, accuracy_db)
+    explained = [f"{line}: {FLAGS[flag].meaning}. Advice: {FLAGS[flag].advice}." for flag, line in flags.items()]
+    summary["remarks"] = explained + summary["remarks"]
+    return NodePayload(columns, np.concatenate(data), {"node": node, **summary})
 
 
 def _summary(columns: Mapping[str, NDArray[Any]], unknown: UnknownSymbols, prf_hz: float) -> dict[str, Any]:
-    """Return numbers of frames and errors, medians of SNR and EVM, and data rates."""
+    """Return numbers of frames and errors, medians of SNR and EVM, data rates, and remarks on counter and check sum."""
     qam, frames, seen = unknown.constellation, unknown.frames, columns["detected"]
     if frames is None:
         raise TypeError("the waveform has no frame format")
     counts = {"frames": seen.size, **{name: int(columns[name].sum()) for name in ("detected", "sure", "intact")}}
-    intact, rate_bit_s = counts["intact"] / max(seen.size, 1), frames.data_bits * prf_hz
+    time_s = seconds_since(columns["time"], columns["time"][0])
+    count = FrameCount.of(columns["counter"], columns["intact"], time_s, prf_hz=prf_hz, bits=frames.counter_bits)
+    received, rate_bit_s = min(counts["intact"] / count.sent, 1.0), frames.data_bits * prf_hz
+    remarks = list[str]()
+    if count.steps > count.agreeing == 0 and not np.ptp(columns["counter"][columns["intact"]]):
+        remarks.append(f"the counter is {columns['counter'][columns['intact']][0]} in all intact frames.")
+    elif count.agreeing < count.steps:
+        remarks.append(
+            f"the counter agrees with time tags and prf_hz in {count.agreeing} of {count.steps} steps from an intact "
+            f"frame to the next; its median advance is {count.advance:g} per frame interval."
+        )
     measured = dict[str, float | None](snr_db=None, evm_db=None, header_bit_error_rate=None)
     if seen.any():
         # eqs. 3 and 16
@@ -185,14 +209,23 @@ def _summary(columns: Mapping[str, NDArray[Any]], unknown: UnknownSymbols, prf_h
         measured["symbol_error_rate_expected"] = float(f"{expected.mean():.3e}")
         lost = 1 - (1 - expected) ** (frames.total_bits // qam.bits_per_symbol)
         measured["frame_error_rate_expected"] = float(f"{lost.mean():.3e}")
+        predicted = float((1 - lost)[columns["sure"][seen]].sum())
+        if not counts["intact"] and predicted > _FEWEST_INTACT:
+            remarks.append(
+                f"no frame is intact, of {predicted:.1f} expected from the SNR. Advice: waveform.codes.frame; "
+                "reflections of the sidelink."
+            )
     return {
         "constellation": qam.name,
         **counts,
-        "frame_error_rate": round(1 - intact, 6),
+        "sent": count.sent,
+        "lost": max(count.sent - counts["intact"], 0),
+        "frame_error_rate": round(1 - received, 6),
         **measured,
         "data_bits_per_frame": frames.data_bits,
         "sent_bit_s": rate_bit_s,
-        "received_bit_s": rate_bit_s * intact,
+        "received_bit_s": rate_bit_s * received,
+        "remarks": remarks,
     }
 
 
@@ -209,7 +242,8 @@ def draw_payload(path: Path, read: Sequence[NodePayload], *, title: str, tags: M
             # lost frames may have no SNR: marks at a constant height above the time axis
             marked = time_s[lost[thinned(len(lost))]] if len(lost) else lost
             height = np.full(len(marked), 0.04 + 0.05 * number)
-            label = f"{node}: {len(lost)} of {len(time_s)} frames lost"
+            unrecorded = max(one.summary["sent"] - len(time_s), 0)
+            label = f"{node}: {len(lost)} frames not intact, {unrecorded} not recorded"
             snr.plot(marked, height, "x", ms=4, color=colour, label=label, transform=snr.get_xaxis_transform())
         least_db, most_db = decibels(qam.least_snr), 2 * decibels(qam.decided(qam.least_snr).evm)
         snr.axhline(least_db, color="0.4", ls="--", label=f"least SNR of {qam.name}: {least_db:.1f} dB")

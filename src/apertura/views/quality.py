@@ -21,7 +21,7 @@ VERDICTS = ("image", "verdict", "peak loss", "expected loss", "numerical error",
 DECISIONS = ("decision", "value", "reason")
 BUDGET = ("cause", "size", "peak loss", "displacement", "phase")
 FLAGGED = ("flag", "images", "measurement", "meaning", "advice")
-PAYLOAD = ("node", "frames", "intact", "SNR, dB", "EVM, dB", "SER", "FER", "bit/s")
+PAYLOAD = ("node", "sent", "recorded", "intact", "SNR, dB", "EVM, dB", "SER", "FER", "bit/s")
 """Table headers."""
 
 
@@ -329,7 +329,7 @@ def flag_rows(reports: Mapping[str, Report]) -> list[Cells]:
 
 def payload_row(summary: Report) -> Cells:
     """Return the table row of a node in payload.json; NaN: no direct path was detected in any frame."""
-    formats = {"frames": "d", "intact": "d", "snr_db": ".1f", "evm_db": ".1f"}
+    formats = {"sent": "d", "frames": "d", "intact": "d", "snr_db": ".1f", "evm_db": ".1f"}
     formats |= {"symbol_error_rate_expected": ".1e", "frame_error_rate": ".3g", "received_bit_s": ".0f"}
     values = {name: summary.get(name) for name in formats}
     cells = (format(float("nan") if values[name] is None else values[name], form) for name, form in formats.items())

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
 from apertura.core.echo.constellation import Constellation, Labels
 
 Bits = NDArray[np.uint8]
@@ -16,6 +17,7 @@ Bits = NDArray[np.uint8]
 CRC_BITS = 16
 _POLYNOMIAL = 0x1021  # x¹⁶ + x¹² + x⁵ + 1
 _START = 0xFFFF
+_AT_ENDS = 9  # frames at each end of a recording, whose median counter is used
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,3 +129,60 @@ class Frames:
     data: Bits
     header_errors: NDArray[np.intp]
     intact: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FrameCount:
+    """Frames sent during a recording, by time tags and counter.
+
+    Attributes
+    ----------
+    sent
+        Number of frames sent from the first to the last capture.
+    steps, agreeing
+        Number of pairs of consecutive intact frames, and of those whose counters agree with the time tags.
+    advance
+        Median advance of the counter in a frame interval.
+    """
+
+    sent: int
+    steps: int
+    agreeing: int
+    advance: float
+
+    @classmethod
+    def of(
+        cls, counter: NDArray[np.int64], intact: NDArray[np.bool_], time_s: Floats, *, prf_hz: float, bits: int
+    ) -> "FrameCount":
+        """Count the frames sent during a recording (eq. 17); without a usable counter, by the time tags alone.
+
+        Parameters
+        ----------
+        counter, intact
+            (capture,) counter, and True for intact frames.
+        time_s
+            (capture,) time tags, seconds from any origin, ascending.
+        prf_hz
+            Frames per second.
+        bits
+            Length of the counter.
+
+        Examples
+        --------
+        >>> counter = np.array([14, 15, 0, 3])
+        >>> FrameCount.of(counter, counter >= 0, np.array([0.0, 0.1, 0.2, 0.5]), prf_hz=10, bits=4)
+        FrameCount(sent=6, steps=3, agreeing=3, advance=1.0)
+        """
+        interval = np.concatenate([[0], np.rint(np.diff(time_s) * prf_hz)]).astype(np.int64).cumsum()
+        by_time, used = int(interval[-1]) + 1, np.flatnonzero(intact)
+        if used.size < 2:
+            return cls(by_time, 0, 0, float("nan"))
+        period, passed, counted = 1 << bits, np.diff(interval[used]), np.diff(counter[used])
+        deviation = (counted - passed + period // 2) % period - period // 2
+        agreeing, steps = int((deviation == 0).sum()), used.size - 1
+        advance = float(np.median(counted % period / np.maximum(passed, 1)))
+        if 2 * agreeing < steps:
+            return cls(by_time, steps, agreeing, advance)
+        drift = np.concatenate([[0], deviation.cumsum()])
+        change = round(float(np.median(drift[-_AT_ENDS:]) - np.median(drift[:_AT_ENDS])))
+        return cls(max(by_time + change, 1), steps, agreeing, advance)

@@ -207,7 +207,8 @@ class SymbolDecider:
                 f"no direct path of {constellation.name} symbols in {count} pulses",
                 where="sidelink",
                 expected=f"data symbols of constellation {constellation.name} above the noise",
-                remedy="Check waveform.codes.constellation, and antenna, gain and recorded channel of the sidelink.",
+                remedy="Check constellation and pilots of waveform.codes, waveform.iq and nodes.<n>.iq, and antenna, "
+                "gain and recorded channel of the sidelink.",
             )
         snr = np.concatenate(snrs)
         median_snr = float(np.median(snr)) if snr.size else 0.0

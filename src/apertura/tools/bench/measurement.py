@@ -67,12 +67,11 @@ from apertura.methods.bench.links import (
 )
 from apertura.stages.acquisition import Captured
 from apertura.stages.ingest import captures_of, checked_recording
-from apertura.stages.symbols import PairSymbols, ambiguous_symbols, rows_of
+from apertura.stages.symbols import FEW_ERRORS, PairSymbols, ambiguous_symbols, rows_of
 from apertura.stages.transmitted import Transmitted, transmitted
 
 _CHANNELS = ("radar", "sidelink")
 _STRETCH = 256  # consecutive captures in each of `GROUPS` groups of a recording
-_FEW_ERRORS = 0.1  # fraction of wrong bits in the header with which the order of I and Q is confirmed
 _EVERY_CAPTURE = 4096
 """Maximum number of captures of a node whose samples are analysed; longer recordings are sampled evenly."""
 
@@ -217,7 +216,8 @@ class Bench:
                 of, "I/Q image", f"{channel.image_db:.1f} dB", f"{limit_db:.0f} dB", *({"channel_image"} & flags)
             )
         if node.symbols:
-            yield line(node.name, "data symbols", node.symbols, "decided in all pulses", "symbols_unsure")
+            names = "symbols_unsure", "constellation_suspect", "header_differs"
+            yield line(node.name, "data symbols", node.symbols, "decided in all recorded pulses", *names)
         yield from self._received(node, line)
         if node.link is not None:
             yield from self._link(node, node.link, line)
@@ -488,10 +488,10 @@ class _Code:
         """Source and quality of decided symbols; empty for known ones."""
         if self.decided is None:
             return ""
-        report = self.decided.report(np.isin(np.arange(len(self.rows)), self.used))
+        report, recorded = self.decided.report(np.isin(np.arange(len(self.rows)), self.used)), (self.rows >= 0).sum()
         return (
             f"{report['constellation']} of the sidelink of {report['node']}, SNR {report['snr_db']:.1f} dB, EVM "
-            f"{report['evm_db']:.1f} dB, decided in {len(self.used)} of {len(self.rows)} pulses"
+            f"{report['evm_db']:.1f} dB, decided in {len(self.used)} of {recorded} pulses recorded by {report['node']}"
         )
 
 
@@ -513,7 +513,7 @@ class _Coded:
         captured, transmitter, unknown = self.captured(name), self.flight.transmitter, self.sent.unknown
         every, channel = np.arange(len(captured.raw.start)), "radar" if name == transmitter else "sidelink"
         # read as configured, or else the complex conjugates
-        orders = captured, replace(captured, order="conjugate" if captured.order == "complex" else "complex")
+        orders = captured, captured.conjugated
         if unknown is None:
             code = _Code(captured, self.sent, captured.frames.numbers, every)
         else:
@@ -537,8 +537,8 @@ class _Coded:
             except CampaignError as problem:
                 problems.append(problem)
             else:
-                found.append((decided.header_errors(tested), captured, decided))
-                if found[-1][0] < _FEW_ERRORS:
+                found.append((decided.symbols.header_error_rate(tested), captured, decided))
+                if found[-1][0] < FEW_ERRORS:
                     break
         if not found:
             raise problems[0]

@@ -72,8 +72,13 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
         report = open_listed(folder / "payload.json", folder / "payload.manifest.json")
         yield Heading(2, "Payload")
         yield from _pictures(folder, {"payload.png": "payload"})
-        caption = "Frames of each node. SER: symbol error rate expected from the SNR; FER: frame error rate."
+        caption = (
+            "Frames sent during the recording of each node, recorded ones, and intact ones. SER: symbol error rate "
+            "expected from the SNR; FER: frame error rate."
+        )
         yield Table(caption, PAYLOAD, [payload_row(summary) for summary in report["nodes"]])
+        for summary in report["nodes"]:
+            yield from (Paragraph(f"{summary['node']}: {remark}") for remark in summary["remarks"])
     raised = flag_rows(reports)
     if campaign.settings.stack and flight in campaign.settings.stack.flights:
         folder = campaign.result(STACK, flight)
