@@ -238,7 +238,7 @@ def transfer_by_code(
     checked = np.concatenate(groups)
     sample = np.concatenate([demodulator.transfer(read(block), block) for block in blocks_of(checked)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
-    if code.carried is not False and len(demodulator.inverse(checked)) > 1:
+    if code.carried is not False and len(demodulator.inverse(checked[:2])) > 1:  # the code changes
         parts = np.split(sample, np.cumsum([len(group) for group in groups])[:-1])
         code = _code_of_parts(code, read, demodulator, list(zip(groups, parts, strict=True)))
     inverted: Mapping[str, str] = {}

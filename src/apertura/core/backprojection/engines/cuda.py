@@ -34,8 +34,7 @@ from apertura.core.backprojection.inputs import Profiles
 # ---- Device and arrays on the device
 #
 # numba.cuda is imported when a device is used. The device executes one call at a time: threads that form tiles wait
-# for the lock of the device without the GIL. With a stream for each of 16 threads, tiles of 256 pixels took twice as
-# long on an H200, because the threads wait for the GIL after every call of the driver.
+# for the lock of the device without the GIL.
 
 _LOCK = Lock()
 # threads per block of the kernel that fills tables, and of the kernel that compares pulses
