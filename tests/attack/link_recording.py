@@ -162,10 +162,12 @@ class Runner:
         start_s = time.monotonic()
         is_ended = was_interrupted = False
         with self.started(command, root) as (group, ending):
+            until_ended = select.poll()  # `select.select` fails for descriptors beyond 1023
+            until_ended.register(ending, select.POLLIN)
             while not is_ended and time.monotonic() - start_s < limit_s:
                 if meanwhile:
                     meanwhile()
-                is_ended = bool(select.select([ending], [], [], 0.002 if meanwhile else 0.02)[0])
+                is_ended = until_ended.poll(2 if meanwhile else 20)
                 if not was_interrupted and command.words.startswith("map ") and self._is_serving():
                     os.killpg(group, signal.SIGINT)
                     was_interrupted = True
@@ -193,6 +195,14 @@ _WRITTEN = _MODIFY | _CLOSE_WRITE | _MOVED_FROM | MOVED_TO | CREATE | _DELETE
 
 _RANDOM = re.compile(r"(?<![0-9A-Za-z])[0-9a-f]{8,}(?![0-9A-Za-z])|tmp[a-z0-9_]{8}|\d{4}-\d\d-\d\dT")
 _CHUNK = re.compile(r"(.*\.zarr/.*?)/c(/.*)?$|(.*\.snakemake/metadata)/[^/]*$|(.*/\.hashes/.*)/[^/]*$")
+
+
+def read_now(descriptor: int) -> bytes:
+    """Return the bytes that a non-blocking descriptor holds; empty if none."""
+    try:
+        return os.read(descriptor, 1 << 18)
+    except BlockingIOError:
+        return b""
 
 
 class Watch:
@@ -229,8 +239,7 @@ class Watch:
     def read(self) -> list[tuple[str, int]]:
         """Return the events so far: path relative to the root, and mask."""
         events: list[tuple[str, int]] = []
-        while select.select([self._descriptor], [], [], 0)[0]:
-            data = os.read(self._descriptor, 1 << 18)
+        while data := read_now(self._descriptor):
             at = 0
             while at < len(data):
                 number, mask, _, length = _EVENT.unpack_from(data, at)

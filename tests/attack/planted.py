@@ -7,7 +7,6 @@ file of GDAL, a file outside the folder) is reported by the kernel (inotify, IN_
 import ctypes
 import os
 import pickle
-import select
 import struct
 import sys
 from collections.abc import Iterator, Mapping
@@ -17,6 +16,8 @@ from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
+
+from .link_recording import read_now
 
 _IN_OPEN, _IN_NONBLOCK = 0x20, 0o4000
 _EVENT = struct.Struct("iIII")
@@ -264,8 +265,7 @@ def opened(paths: list[Path]) -> Iterator[set[Path]]:
             names[number] = path
         opened_paths: set[Path] = set()
         yield opened_paths
-        while select.select([watching], [], [], 0)[0]:
-            events = os.read(watching, 1 << 16)
+        while events := read_now(watching):
             at = 0
             while at < len(events):
                 number, mask, _, length = _EVENT.unpack_from(events, at)

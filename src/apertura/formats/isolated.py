@@ -1,9 +1,11 @@
 """Execution of readers that may crash in a child process, with limits of memory and time; failures are reported.
 
-The child process receives paths and returns arrays as .npy files. Its output is neither executed nor unpickled.
+The child process receives paths and returns all arrays in one file, which is mapped once: a flight may have more files
+than a process may hold open. The output is neither executed nor unpickled.
 """
 
 import json
+import math
 import os
 import pkgutil
 import resource
@@ -14,7 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +34,7 @@ BYTES_PER_BYTE = 16
 SECONDS, SECONDS_PER_BYTE = 30.0, 1e-6
 """Time limit of a reader, s: fixed part, and part per byte of its files."""
 
+_ARRAYS = "arrays"
 _REFUSED = 3
 _THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
 
@@ -112,7 +115,8 @@ def read_isolated(
         finished = sum((folder / f"{number}.json").is_file() for number in range(len(paths)))
         if found or finished < len(paths):
             raise UnreadableError(paths[min(finished, len(paths) - 1)], found or "its reader wrote no output")
-        return [_read(folder, number) for number in range(len(paths))]
+        mapped = np.memmap(folder / _ARRAYS, mode="r")
+        return [_read(folder / f"{number}.json", mapped) for number in range(len(paths))]
 
 
 def _ended(status: int, stderr: bytes) -> str:
@@ -123,16 +127,30 @@ def _ended(status: int, stderr: bytes) -> str:
     return "" if status == 0 else shown(lines[-1] if lines else f"its reader exited with status {status}", 300)
 
 
-def _read(folder: Path, number: int) -> dict[str, NDArray[Any]]:
-    names = json.loads((folder / f"{number}.json").read_text())
-    return {
-        name: np.load(folder / f"{number}.{index}.npy", mmap_mode="r", allow_pickle=False)
-        for index, name in enumerate(names)
-    }
+def _read(index: Path, mapped: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    arrays = {}
+    for name, kind, shape, start in json.loads(index.read_text()):
+        dtype = np.dtype(kind)
+        stop = start + dtype.itemsize * math.prod(shape)
+        arrays[name] = mapped[start:stop].view(dtype).reshape(shape)
+    return arrays
+
+
+def _write(index: Path, file: BinaryIO, arrays: dict[str, NDArray[Any]]) -> None:
+    """Append arrays to the common file, each at a multiple of 64 bytes; write their types, shapes and offsets."""
+    entries = []
+    for name, array in arrays.items():
+        if array.dtype.hasobject or array.dtype.fields:
+            raise TypeError(f"{name} has type {array.dtype}")
+        file.write(bytes(-file.tell() % 64))
+        entries.append((name, array.dtype.str, array.shape, file.tell()))
+        np.asarray(array, order="C").tofile(file)
+    file.flush()
+    index.write_text(json.dumps(entries))
 
 
 def _main(function: str, memory_bytes: str, seconds: str, folder: str, *paths: str) -> int:
-    """Set the limits of this process, and read files; write the arrays of each file, then the names of the arrays."""
+    """Set the limits of this process, read the files, and write their arrays."""
     limits = {
         resource.RLIMIT_AS: int(memory_bytes),
         resource.RLIMIT_FSIZE: int(memory_bytes),
@@ -145,11 +163,10 @@ def _main(function: str, memory_bytes: str, seconds: str, folder: str, *paths: s
         resource.setrlimit(kind, (bound, bound))
     try:
         reader = pkgutil.resolve_name(function)
-        for number, path in enumerate(paths):
-            arrays = reader(Path(path))
-            for index, array in enumerate(arrays.values()):
-                np.save(Path(folder) / f"{number}.{index}.npy", array, allow_pickle=False)
-            (Path(folder) / f"{number}.json").write_text(json.dumps(list(arrays)))
+        with (Path(folder) / _ARRAYS).open("wb") as file:
+            file.write(bytes(64))  # an empty file cannot be mapped
+            for number, path in enumerate(paths):
+                _write(Path(folder) / f"{number}.json", file, reader(Path(path)))
     except Exception as error:  # any exception of a parser means that the file is unreadable
         text = "its reader ran out of memory" if isinstance(error, MemoryError) else " ".join(str(error).split())
         sys.stderr.write((text or type(error).__name__).encode("ascii", "backslashreplace").decode() + "\n")
