@@ -1,9 +1,11 @@
 """Isolated readers: a crash, hang or memory exhaustion ends only the reader's process."""
 
+import gc
 import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy.io import savemat
 
 from apertura.common.lazy import Lazy
 from apertura.formats.isolated import UnreadableError, read_isolated
+from apertura.formats.phase_histories import mat_fields
 from apertura.formats.reading import read_phase_history
 
 PULSES, LINES = 6, 5
@@ -114,6 +117,20 @@ def test_reader_that_exceeds_the_memory_limit_is_stopped(tmp_path):
     os.truncate(tmp_path / "a.mat", 3 << 30)
     with pytest.raises(UnreadableError, match="its reader ran out of memory"):
         read_isolated(Lazy("numpy").fromfile, [tmp_path / "a.mat"], memory_bytes=1 << 30)
+
+
+@pytest.mark.usefixtures("reader")
+def test_arrays_of_all_files_are_one_mapping(tmp_path):
+    """A flight may have more files than a process may hold open."""
+    paths = [history(tmp_path / f"{name}.mat") for name in "abcdef"]
+    gc.collect()  # arrays of other tests
+    before = sum(1 for _ in Path("/proc/self/fd").iterdir())
+    files = read_isolated(mat_fields.read_fields, paths)
+    assert sum(1 for _ in Path("/proc/self/fd").iterdir()) == before + 1
+    for fields in files:
+        np.testing.assert_allclose(fields["z"].ravel(), np.full(PULSES, 7000.0))
+        np.testing.assert_allclose(fields["fp"][:, 1], np.exp(1j * (1 + PULSES * np.arange(LINES))))
+        assert not fields["fp"].flags.writeable
 
 
 @pytest.mark.usefixtures("reader")
