@@ -218,6 +218,33 @@ def test_value_outside_all_alternatives_is_reported_by_its_key(tiny):
     )
 
 
+@pytest.mark.parametrize(
+    ("codes", "expected"),
+    [
+        ({"generator": "pn", "polynomial": [23, 18], "seed": 0}, "seed: Input should be greater than or equal to 1"),
+        ({"generator": "pn", "polynomal": [23, 18]}, "polynomal: unknown key (did you mean 'polynomial'?)"),
+        ({"source": "sidelink"}, "constellation: missing"),
+        ({"source": "sidelnk", "constellation": "qpsk"}, "source: Input should be 'sidelink' (found 'sidelnk')"),
+        (
+            {"source": "sidelink", "constellation": "qpsk", "frame": {"counter_bits": 0}},
+            "frame.counter_bits: Input should be greater than or equal to 1 (found 0)",
+        ),
+    ],
+)
+def test_wrong_part_of_an_alternative_is_reported_without_the_other_alternatives(tiny, codes, expected):
+    edit_config(tiny, lambda document: document["waveform"].update(codes=codes))
+    message = complaint(lambda: Campaign.load(tiny))
+    assert f"waveform.codes.{expected}" in message
+    assert not any(other in message for other in ("valid string", "generator", " or Input", "Codes"))
+
+
+def test_value_of_no_alternative_is_reported_with_all_of_them(tiny):
+    edit_config(tiny, lambda document: document["waveform"].update(codes=5))
+    message = complaint(lambda: Campaign.load(tiny))
+    expected = "waveform.codes: Input should be a valid string (found 5) or Input should be a valid mapping (found 5)"
+    assert expected in message
+
+
 def test_swapped_bounds_are_refused_with_sorted_bounds(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m=[570664.3, 5363704.2, 570658.3, 5363710.2]))
     assert "sorted: [570658.3, 5363704.2, 570664.3, 5363710.2]" in complaint(lambda: Campaign.load(tiny))

@@ -3,6 +3,7 @@
 import difflib
 import json
 import re
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -259,6 +260,8 @@ T = TypeVar("T")
 _TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)$"
 """Components that pydantic adds to the location of a key if the key accepts several types."""
 
+_UNKNOWN = {"extra_forbidden", "unexpected_keyword_argument"}
+
 _MOST_COMPLAINTS = 12
 
 LARGEST_NUMBER = 1e15
@@ -304,9 +307,8 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
 def _tags_and_keys(model: Any) -> tuple[set[str], set[str]]:
     """Return the names of alternative types and the keys in the JSON schema of a model."""
     schema = TypeAdapter(model).json_schema()
-    return _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {})), _collected(
-        schema, _properties
-    )
+    tags = _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {}))
+    return tags | set(schema.get("$defs", {})), _collected(schema, _properties)
 
 
 def _numbers(value: object, location: tuple[str, ...]) -> Iterator[tuple[str, float]]:
@@ -322,22 +324,50 @@ def _numbers(value: object, location: tuple[str, ...]) -> Iterator[tuple[str, fl
 
 
 def _complaints(error: ValidationError, tags: set[str], keys: set[str]) -> str:
-    wrong: dict[str, list[str]] = {}
-    for item in error.errors(include_url=False, include_context=False)[: 10 * _MOST_COMPLAINTS]:
-        key, line = _complaint(dict(item), tags, keys)
-        wrong.setdefault(quoted(key)[1:-1], []).append(line)
-    lines = [f"{key}: {' or '.join(complaints[:_MOST_COMPLAINTS])}" for key, complaints in wrong.items()]
+    wrong: dict[str, dict[str, None]] = {}
+    items = _of_nearest_types([dict(item) for item in error.errors(include_url=False, include_context=False)], tags)
+    for item in items[: 10 * _MOST_COMPLAINTS]:
+        key, line = _complaint(item, tags, keys)
+        wrong.setdefault(quoted(key)[1:-1], {})[line] = None
+    lines = [f"{key}: {' or '.join([*complaints][:_MOST_COMPLAINTS])}" for key, complaints in wrong.items()]
     lines.sort(key=lambda line: "unknown key" not in line)
-    more = len(lines) > _MOST_COMPLAINTS or error.error_count() > 10 * _MOST_COMPLAINTS
-    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and more, {error.error_count()} in total" if more else "")
+    more = len(lines) > _MOST_COMPLAINTS or len(items) > 10 * _MOST_COMPLAINTS
+    return "; ".join(lines[:_MOST_COMPLAINTS]) + (f"; and more, {len(items)} in total" if more else "")
+
+
+def _of_nearest_types(items: list[dict[str, Any]], tags: set[str]) -> list[dict[str, Any]]:
+    """Keep, of the errors of keys that accept several types, those of the type with the fewest wrong parts.
+
+    Types whose parts were not examined, since the value has another type, are kept only if no other type is left.
+    """
+    wrong_parts: defaultdict[tuple[str, ...], Counter[str]] = defaultdict(Counter)
+    for item in items:
+        parts = tuple(map(str, item["loc"]))
+        for at in _types_in(item, tags):
+            wrong_parts[parts[:at]][parts[at]] += len(parts) > at + 1
+
+    def is_nearest(key: tuple[str, ...], name: str) -> bool:
+        counts = wrong_parts[key]
+        return counts[name] == min(filter(None, counts.values()), default=0)
+
+    def is_kept(item: dict[str, Any]) -> bool:
+        parts = tuple(map(str, item["loc"]))
+        return all(is_nearest(parts[:at], parts[at]) for at in _types_in(item, tags))
+
+    return list(filter(is_kept, items))
+
+
+def _types_in(item: dict[str, Any], tags: set[str]) -> list[int]:
+    """Return the positions of the names of alternative types in the location of an error."""
+    parts = [*map(str, item["loc"])]
+    keys = parts[: -(item["type"] in _UNKNOWN) or None]  # an unknown key may have the name of a type
+    return [at for at, part in enumerate(keys) if re.match(_TYPE, part) or part in tags]
 
 
 def _complaint(item: dict[str, Any], tags: set[str], keys: set[str]) -> tuple[str, str]:
     """Return a key and its error; the location of the key is stripped of the names of alternative types."""
-    parts, unknown = [*map(str, item["loc"])], item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}
-    own = parts[-1:] if unknown else []  # always a key, even if it has the name of an alternative type
-    parents = parts[:-1] if unknown else parts
-    location = [part for part in parents if not (re.match(_TYPE, part) or part in tags)] + own
+    types, unknown = _types_in(item, tags), item["type"] in _UNKNOWN
+    location = [str(part) for at, part in enumerate(item["loc"]) if at not in types]
     key = ".".join(location) or "the whole file"
     if unknown:
         known = sorted(keys - {location[-1]})  # the key may belong to another section
@@ -346,7 +376,8 @@ def _complaint(item: dict[str, Any], tags: set[str], keys: set[str]) -> tuple[st
     if item["type"] == "missing":
         return key, "missing"
     shown = "" if isinstance(item["input"], dict | BaseModel | ArgsKwargs) else f" (found {quoted(item['input'])})"
-    return key, f"{item['msg'].removeprefix('Value error, ')}{shown}"
+    message = re.sub(r"dictionary or instance of \w+", "mapping", item["msg"].removeprefix("Value error, "))
+    return key, f"{message}{shown}"
 
 
 def _properties(part: dict[str, Any]) -> Any:
