@@ -198,6 +198,7 @@ def sidelink_of(rng, name, snr_db, frames=400):
     return codes, weight, common, (received / codes).astype(np.complex64)
 
 
+@pytest.mark.quick("*-64qam")
 @pytest.mark.parametrize("name", QAM)
 @pytest.mark.parametrize(("method", "cells"), [("two_parameter", 1), ("gated", 33)])
 def test_weighted_sidelink_has_the_noise_of_a_constant_modulus(name, method, cells):
@@ -240,6 +241,7 @@ def test_weak_symbols_of_a_sidelink_are_not_taken_for_interference():
     assert limited(sidelink, weight)[1][:, 20].all()
 
 
+@pytest.mark.quick("12.0--5.0-*-64qam", "25.0-15.0-*-16qam")
 @pytest.mark.parametrize("name", QAM)
 @pytest.mark.parametrize("item", ["reciprocal", "wiener"])
 @pytest.mark.parametrize("snr_db", [-5.0, 15.0])

@@ -116,6 +116,7 @@ def test_pulses_are_unsure_below_the_least_snr(name: str) -> None:
     assert 10 * np.log10(np.median(decisions.snr)) == pytest.approx(least_db - 1, abs=0.4)
 
 
+@pytest.mark.quick("16qam")
 @pytest.mark.parametrize("name", ["qpsk", "16qam", "64qam"])
 def test_pulses_with_a_changing_reflection_are_decided_or_unsure(name: str) -> None:
     """Of pulses with a reflection of another phase in each, less than 0.1 % are sure with wrong symbols."""
@@ -132,6 +133,7 @@ def test_pulses_with_a_changing_reflection_are_decided_or_unsure(name: str) -> N
     assert wrong_and_sure < 1e-3 * 3 * pulses
 
 
+@pytest.mark.quick("64qam-*")
 @pytest.mark.parametrize(("name", "most"), [("qpsk", 0.0), ("16qam", 0.0), ("64qam", 0.0), ("256qam", 3e-3)])
 def test_pulses_without_a_reflection_are_sure(name: str, most: float) -> None:
     """Share of 2048 pulses, 2 dB above the least SNR, that the tests of noise and channel exclude."""
