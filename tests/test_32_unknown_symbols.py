@@ -279,6 +279,42 @@ def test_another_constellation_is_found_by_the_points_that_its_symbols_do_not_oc
     assert right.flags == {}
 
 
+@pytest.mark.parametrize(
+    ("sent", "configured", "snr_db", "sure"),
+    [("64qam", "16qam", 25.0, True), ("256qam", "64qam", 35.0, True), ("16qam", "qpsk", 20.0, False)],
+)
+@pytest.mark.parametrize("pilots", [None, pilot_comb()], ids=["blind", "pilots"])
+def test_larger_constellation_is_found_by_the_kurtosis_of_the_errors(
+    sent: str, configured: str, snr_db: float, sure: bool, pilots: Pilots | None
+) -> None:
+    """Eq. 20: 64-QAM is decided as 16-QAM in sure pulses, and evenly."""
+    sidelink = Sidelink(constellation(sent), snr_db, pilots=pilots)
+    check = checked(sidelink, sidelink.decider(constellation(configured), pilots))
+    assert (check.pulses > GROUP // 2) == sure
+    assert check.flags.keys() == check.larger.keys() == {"constellation_suspect"}
+    assert f"a larger constellation than {configured}" in check.flags["constellation_suspect"]
+    assert checked(sidelink, sidelink.decider(constellation(sent), pilots)).flags == {}
+
+
+@pytest.mark.parametrize("name", CONSTELLATIONS)
+@pytest.mark.parametrize("excess_db", [-3.0, 0.0, 3.0])
+def test_errors_by_noise_are_not_those_of_a_larger_constellation(name: str, excess_db: float) -> None:
+    qam = constellation(name)
+    sidelink = Sidelink(qam, 10 * np.log10(qam.least_snr) + excess_db, reflection_db=-10.0)
+    check = checked(sidelink, sidelink.decider(qam))
+    assert check.kurtosis / check.detected > 1.6
+    assert check.larger == {}
+
+
+def test_small_errors_of_equal_magnitude_are_not_those_of_a_larger_constellation() -> None:
+    """The image of I and Q of QPSK, -25 dB: κ is 1."""
+    sidelink = Sidelink(constellation("qpsk"), 60.0)
+    sidelink.received += 10 ** (-25 / 20) * sidelink.received[:, ::-1].conj()
+    check = checked(sidelink, sidelink.decider(constellation("qpsk")))
+    assert check.kurtosis / check.detected < 1.2
+    assert check.flags == {}
+
+
 def test_data_that_are_not_scrambled_are_found_by_their_occupancy() -> None:
     """Capital letters in ASCII: bits 010 or 100 and 101 begin each byte, so that 16-QAM uses few of its points."""
     qam, pilots = constellation("16qam"), pilot_comb()

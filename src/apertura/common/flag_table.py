@@ -249,9 +249,10 @@ _OF_RECORDINGS = {
         "core/echo/decided_symbols.py",
     ),
     "constellation_suspect": Flag(
-        "constellation with such an occupancy; mean power of the decided symbols, dB",
-        "the decided data symbols do not occupy the points of the configured constellation uniformly: another "
-        "constellation was sent, which changes the amplitude of images, or the data are not scrambled, which does not",
+        "constellation with such an occupancy, and mean power of the decided symbols, dB; or kurtosis of their errors",
+        "the decided data symbols do not occupy the points of the configured constellation uniformly, or their errors "
+        "are those of a larger constellation: another one was sent, which changes the amplitude of images, or the data "
+        "are not scrambled, which does not",
         "waveform.codes.constellation; scrambling of the data",
         "core/echo/decided_symbols.py",
     ),

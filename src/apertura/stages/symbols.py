@@ -178,10 +178,11 @@ class PairSymbols:
 
     def flags(self, usable: NDArray[np.bool_]) -> dict[str, str]:
         """Return the flags of unsure pulses of the source, and of the check of sure ones; `usable`: used pulses."""
-        checked = dict[str, str]()
-        if self.check is not None and not self._divided:
-            raised = check_flags(self.check, self.recorded, self.sent, self.accuracy_db)
-            checked = {flag: f"sidelink of {self.source}: {line}" for flag, line in raised.items()}
+        raised = dict[str, str]()
+        if self.check is not None:
+            check = self.check
+            raised = check.larger if self._divided else check_flags(check, self.recorded, self.sent, self.accuracy_db)
+        checked = {flag: f"sidelink of {self.source}: {line}" for flag, line in raised.items()}
         return Flags.merged(checked, self.symbols.flags(usable[self.rows >= 0], divided=self._divided))
 
     @property

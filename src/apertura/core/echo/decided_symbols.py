@@ -26,6 +26,8 @@ _CHANNEL_GROUPS, _CHANNEL_PULSES = 32, 64  # groups of pulses with a mean channe
 _CLOCK_PULSES = 64  # pulses in each group from which the clock is measured
 # Limits of eqs. 18 and 19: probability of a flag of random symbols, unevenness, and tolerated fraction of wrong bits
 _FALSE_ALARM, _UNEVEN, _WRONG_SHARE = 1e-7, 0.1, 0.02
+# Limits of eq. 20: kurtosis of the errors, and their mean power relative to that of the least SNR
+_KURTOSIS, _LEAST_POWER = 1.45, 0.5
 _SIMILAR = 0.1  # relative difference of the number of equally frequent points from that of a constellation
 
 
@@ -189,7 +191,7 @@ class SidelinkSymbols:
 
 @dataclass(eq=False)
 class DecisionCheck:
-    """Check of decided symbols against constellation and header (eqs. 18 and 19).
+    """Check of decided symbols against constellation and header (eqs. 18 to 20).
 
     Attributes
     ----------
@@ -199,6 +201,8 @@ class DecisionCheck:
         (label,) int64, number of decided data symbols behind header and counter at each point.
     pulses, wrong_bits, expected_bits
         Number of sure pulses, wrong bits of their headers, and expected number of wrong bits.
+    detected, error_power, kurtosis
+        Number of pulses with a direct path, and sums of error power and kurtosis over these pulses.
 
     Examples
     --------
@@ -216,14 +220,21 @@ class DecisionCheck:
     pulses: int = 0
     wrong_bits: int = 0
     expected_bits: float = 0.0
+    detected: int = 0
+    error_power: float = 0.0
+    kurtosis: float = 0.0
 
     def __post_init__(self) -> None:
         """Set the occupancy to 0."""
         self.occupancy = np.zeros(self.symbols.decider.constellation.points.size, np.int64)
 
     def add(self, decisions: Decisions) -> None:
-        """Add the sure pulses of a block of decisions."""
+        """Add a block of decisions: kurtosis of all pulses with a direct path, the rest of sure pulses."""
         qam, frames, sure = self.symbols.decider.constellation, self.symbols.frames, decisions.sure
+        locked = decisions.path.locked
+        self.detected += int(locked.sum())
+        self.error_power += float(np.square(decisions.evm[locked]).sum())
+        self.kurtosis += float(decisions.kurtosis[locked].sum())
         self.pulses += int(sure.sum())
         self.occupancy += np.bincount(decisions.labels[sure][:, self._places].ravel(), minlength=self.occupancy.size)
         if frames is not None:
@@ -248,9 +259,24 @@ class DecisionCheck:
         return bool(self.wrong_bits > most + _WRONG_SHARE * self.pulses * self.symbols.frames.header.size)
 
     @property
+    def larger(self) -> dict[str, str]:
+        """Flag of errors that have the magnitudes of a larger constellation, not those of noise (eq. 20)."""
+        qam, pulses = self.symbols.decider.constellation, max(self.detected, 1)
+        kurtosis, power = self.kurtosis / pulses, self.error_power / pulses
+        certain = _KURTOSIS - 4 / np.sqrt(pulses * self.symbols.decider.data_places.size)
+        if kurtosis > certain or power < _LEAST_POWER * qam.decided(qam.least_snr).evm ** 2:
+            return {}
+        line = (
+            f"errors of the decisions have similar magnitudes (kurtosis {kurtosis:.2f}, noise at least 1.6), as of a "
+            f"larger constellation than {qam.name}"
+        )
+        return {"constellation_suspect": line}
+
+    @property
     def flags(self) -> dict[str, str]:
-        """Flags of an occupancy that is not uniform, and of a header with too many errors."""
-        flags, qam, count, places = {}, self.symbols.decider.constellation, self.occupancy.sum(), self._places.size
+        """Flags of a larger constellation, an occupancy that is not uniform, and a header with too many errors."""
+        qam, count, places = self.symbols.decider.constellation, self.occupancy.sum(), self._places.size
+        flags = self.larger
         if count and places:
             frequency = self.occupancy / count
             uneven = qam.points.size * float(np.square(frequency).sum()) - 1  # eq. 18

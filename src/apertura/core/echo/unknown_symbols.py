@@ -99,6 +99,9 @@ class Decisions:
         Direct path of each pulse; its `locked` is False if no direct path is detected.
     evm
         (pulse,) float64, error vector magnitude relative to the decisions, of data symbols of unit mean power.
+    kurtosis
+        (pulse,) float64, E|e|⁴/(E|e|²)² of the errors e of the received data symbols; 2 for noise without wrong
+        decisions, and less if the errors have similar magnitudes.
     snr
         (pulse,) float64, SNR per subcarrier that corresponds to the error vector magnitude.
     sure
@@ -110,6 +113,7 @@ class Decisions:
     labels: Labels
     path: LineOfSight
     evm: Floats
+    kurtosis: Floats
     snr: Floats
     sure: Bools
 
@@ -121,6 +125,7 @@ class _Pulses(NamedTuple):
     symbols: Complexes
     labels: Labels
     error: Floats
+    kurtosis: Floats
     channel: Complexes
 
     @property
@@ -227,7 +232,7 @@ class SymbolDecider:
         decider = decider._with_shape(decider._initial_shape(received / direct))
         for _ in range(_ROUNDS):  # the mean of the channel after removal of the decisions (eq. 11)
             flat = received / decider.shapes
-            path, symbols, _, error = decider._fitted(flat, decider._detected(flat), decider.shapes)
+            path, symbols, _, error, _ = decider._fitted(flat, decider._detected(flat), decider.shapes)
             weight = (path.amplitude / np.square(error))[:, None]
             decider = decider._with_shape((weight * received / (symbols * phasor(path, received.shape[1]))).sum(0))
         return decider
@@ -266,7 +271,8 @@ class SymbolDecider:
             doubt += _early(pulse.channel / shape) / _MOST_EARLY
         limit = self.constellation.decided(self.constellation.least_snr).evm
         sure = path.locked & (error <= limit) & (doubt <= 1)
-        return Decisions(pulse.symbols, pulse.labels, path, error, self.constellation.snr_of_evm(error), sure)
+        snr = self.constellation.snr_of_evm(error)
+        return Decisions(pulse.symbols, pulse.labels, path, error, pulse.kurtosis, snr, sure)
 
     def _solved(self, sidelink: Complexes, initial: Complexes) -> "_Pulses":
         """Return the symbols of pulses from an initial channel, (pulse, subcarrier), and the channel of each pulse.
@@ -274,10 +280,10 @@ class SymbolDecider:
         The channel is estimated within ±16 cells of the direct path (eq. 12), and absorbs a part of the noise.
         """
         subcarriers, flat = sidelink.shape[1], sidelink / initial
-        path, symbols, labels, error = self._fitted(flat, self._detected(flat), initial)
+        path, symbols, labels, error, kurtosis = self._fitted(flat, self._detected(flat), initial)
         absorbed, rows = _basis(subcarriers).shape[1] / subcarriers, np.flatnonzero(path.locked)
         direct = phasor(path, subcarriers) * np.maximum(path.amplitude, 1e-30)[:, None].astype(np.float32)
-        pulses = _Pulses(path, symbols, labels, error, initial.copy())
+        pulses = _Pulses(path, symbols, labels, error, kurtosis, initial.copy())
         for _ in range(_CHANNELS):
             if not rows.size:
                 break
@@ -287,7 +293,7 @@ class SymbolDecider:
             own_error = own[3] / np.sqrt(1 - absorbed)
             better = own_error < _LEAST_GAIN * error[rows]
             rows = rows[better]
-            for of_all, of_rows in zip(pulses.arrays[-4:], (own[1], own[2], own_error, channel), strict=True):
+            for of_all, of_rows in zip(pulses.arrays[-5:], (*own[1:3], own_error, own[4], channel), strict=True):
                 of_all[rows] = of_rows[better]
         return pulses
 
@@ -371,8 +377,8 @@ class SymbolDecider:
 
     def _fitted(
         self, flat: Complexes, path: LineOfSight, shape: Complexes, *, updates: int = _UPDATES
-    ) -> tuple[LineOfSight, Complexes, Labels, Floats]:
-        """Return direct path, symbols, labels and error vector magnitude after fits to the decisions (eq. 11)."""
+    ) -> tuple[LineOfSight, Complexes, Labels, Floats, Floats]:
+        """Return direct path, symbols, labels, EVM and kurtosis after fits to the decisions (eqs. 11 and 20)."""
         subcarriers = flat.shape[1]
         number = (np.arange(subcarriers) - (subcarriers - 1) / 2).astype(np.float32)
         power = np.square(shape.real) + np.square(shape.imag)
@@ -398,12 +404,14 @@ class SymbolDecider:
                 amplitude=path.amplitude * np.abs(gain),
             )
         error = received - symbols
-        error_power = np.square(error.real) + np.square(error.imag)
+        error_power = (np.square(error.real) + np.square(error.imag)) * power
         data = np.ones(subcarriers, np.float32)
         if self.pilots is not None:
             data[self.pilots.places] = 0
-        evm = np.sqrt((error_power * power) @ data / np.maximum(np.broadcast_to(power, flat.shape) @ data, 1e-30))
-        return path, symbols, labels, np.asarray(evm, np.float64)
+        mean_power = np.maximum(np.broadcast_to(power, flat.shape) @ data, 1e-30)
+        first, second = (np.asarray(moment @ data, np.float64) for moment in (error_power, np.square(error_power)))
+        kurtosis = data.sum() * second / np.maximum(np.square(first), 1e-30)
+        return path, symbols, labels, np.sqrt(first / mean_power), kurtosis
 
 
 def _smooth(channel: NDArray[Any]) -> Complexes:
