@@ -16,8 +16,9 @@ from pathlib import Path
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import save_document
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.stages import assess, coverage, cube, echo, export, image, ingest, layers, profile, refine, scene
+from apertura.stages import coverage, cube
 from benchmarks.products import enlarge, measured, run_step
 
 
@@ -26,24 +27,10 @@ def prepare(root: Path, flights: int, side: int | None) -> list[str]:
     from dataclasses import replace
 
     plan = replace(preset("demo", pulses=40), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
-    campaign = Campaign.load(simulate(root, plan, seed=7))
+    campaign = process(simulate(root, plan, seed=7), last="assess")
     (flight,) = campaign.image_flights
-    for node in flight.nodes:
-        ingest.ingest(campaign, flight.name, node)
-    for pair in flight.pairs:
-        echo.echo(campaign, flight.name, pair)
-    scene.scene(campaign)
-    for pair in flight.pairs:
-        profile.profile(campaign, flight.name, pair)
-    refine.refine(campaign, flight.name)
-    for pair in flight.pairs:
-        image.image(campaign, flight.name, pair)
-    assess.assess(campaign, flight.name)
     if side is None:
-        for pair in flight.pairs:
-            layers.layers(campaign, flight.name, pair)
-            export.export(campaign, flight.name, pair)
-        export.export(campaign, flight.name, "fused")
+        process(campaign, first="layers", last="export_fused")
     else:
         settled = json.loads(campaign.result("scene.json").read_text())
         settled["grid"]["shape"] = [side, side]

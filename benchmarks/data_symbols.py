@@ -17,8 +17,9 @@ import yaml
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.core.echo.captures import blocks_of
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, Impairments, preset, simulate
-from apertura.stages import echo, image, ingest, profile, refine, scene
+from apertura.stages import ingest
 from apertura.stages.transfer import PairEcho
 
 PULSES, SIDELINK_DB = 200, 25.0
@@ -54,16 +55,10 @@ def imaged(root: Path, symbol_filter: str) -> Formed:
     }
     path.write_text(yaml.safe_dump(document))
     campaign = Campaign.load(root)
-    for pair in PAIRS:
-        echo.echo(campaign, "f01", pair)
-    scene.scene(campaign)
-    for pair in PAIRS:
-        profile.profile(campaign, "f01", pair)
-    refine.refine(campaign, "f01")
+    process(campaign, first="echo", last="image")
     formed: Formed = {}
     nodes = json.loads((root / "truth.json").read_text())["flights"]["f01"]["nodes"]
     for pair in PAIRS:
-        image.image(campaign, "f01", pair, threads=1)
         stage = {name: open_stage(campaign.stage(name, "f01", pair), name) for name in ("image", "profile", "echo")}
         scale = nodes[pair.split("-")[1]]["channels"]["radar"]["full_scale"]  # of the converter, which includes noise
         pixels, profiles = (stage[name][name].values * scale for name in ("image", "profile"))

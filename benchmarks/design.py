@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from judging.run import image_steps
 from rich.console import Console
 from rich.table import Table
 
@@ -23,8 +22,8 @@ from apertura.campaign.store import open_stage
 from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.angles import surface
+from apertura.run.process import process
 from apertura.simulation.targets import Clutter, Origin, PointTarget
-from apertura.stages import interferogram, layers
 from apertura.stages.pair import open_pair
 from apertura.stages.radiometry import calibrated_pair
 from apertura.stages.scene import open_scene
@@ -163,12 +162,8 @@ def standing(opened, half):
 def processed(root: Path) -> Campaign:
     campaign = Campaign.load(root)
     with contextlib.redirect_stdout(io.StringIO()):
-        for flight in campaign.image_flights:
-            image_steps(campaign, flight)
-            for pair in flight.pairs:
-                layers.layers(campaign, flight.name, pair)
-        for name in campaign.settings.interferometry.pairs:
-            interferogram.interferogram(campaign, name)
+        process(campaign, last="layers")
+        process(campaign, first="interferogram", last="interferogram")
     return campaign
 
 

@@ -16,6 +16,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.core.echo.dechirp import FrequencySweep
 from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.run.process import process
 from apertura.simulation import (
     CampaignSpecification,
     ImageGrid,
@@ -28,7 +29,6 @@ from apertura.simulation import (
     simulate,
 )
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
-from apertura.stages import echo, image, ingest, profile, refine, scene
 from apertura.stages.scene import open_scene
 
 TARGETS = ((0.0, 0.0, 0.0), (-2.0, 2.0, 0.0), (2.5, -1.5, 0.0))
@@ -68,15 +68,11 @@ def formed(root: Path, window: str) -> tuple[Campaign, float]:
     document["processing"] = {"autofocus": False, "window": window}
     path.write_text(yaml.safe_dump(document))
     campaign = Campaign.load(root)
-    if campaign.settings.waveform.kind == "ofdm":
-        ingest.ingest(campaign, "f01", "uav1")
+    process(campaign, last="ingest")
     start_s = time.process_time()
-    echo.echo(campaign, "f01", "uav1-uav1")
+    process(campaign, first="echo", last="echo")
     seconds = time.process_time() - start_s
-    scene.scene(campaign)
-    profile.profile(campaign, "f01", "uav1-uav1")
-    refine.refine(campaign, "f01")
-    image.image(campaign, "f01", "uav1-uav1", threads=2)
+    process(campaign, first="scene", last="image", threads=2)
     return campaign, seconds
 
 

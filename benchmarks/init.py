@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from folders import run_steps
 from loose_files import epochs, int16_and_logs, truth, write_ulog
 
 from apertura import simulation
@@ -23,6 +22,7 @@ from apertura.check import problems
 from apertura.core.echo.dechirp import FrequencySweep
 from apertura.core.quality.bright_points import brightest_near
 from apertura.core.quality.point_targets import find_peak
+from apertura.run.process import process
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 from apertura.simulation.waveform import PulseSpecification
 from apertura.stages.cphd import cphd
@@ -92,7 +92,7 @@ def fmcw_ulog(folder: Path) -> Loose:
 def cphd_history(folder: Path) -> Loose:
     """Phase history of another processor: a CPHD file with positions."""
     root = simulation.simulate(folder / "simulated", without_constants(simulation.preset("paper", pulses=400)), seed=1)
-    campaign = run_steps(root, exports=False)
+    campaign = process(root, last="cube")
     (folder / "loose").mkdir()
     shutil.copyfile(str(cphd(campaign, "f01", "uav1-uav1")), folder / "loose/collect.cphd")
     return folder / "loose", truth(root), {"scene.height_m": "620 left"}, {}
@@ -143,7 +143,7 @@ def main(names: list[str]) -> None:
                 file=sys.stderr,
             )
             start_s = time.perf_counter()
-            campaign = run_steps(made.folder, exports=False)
+            campaign = process(made.folder, last="cube")
             run_s = time.perf_counter() - start_s
             errors = position_errors_m(campaign, targets)
             every = 100 * np.concatenate([*errors.values()])

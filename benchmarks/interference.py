@@ -16,7 +16,6 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-from judging.run import image_steps
 from rich.console import Console
 from rich.table import Table
 
@@ -53,7 +52,7 @@ def process(root: Path, pulses: int, sources: list[Interferer], setting: str) ->
     config.write_text(f"{config.read_text()}\nprocessing: {{interference: {setting}, autofocus: 'off'}}\n")
     campaign = Campaign.load(root)
     with redirect_stdout(StringIO()):
-        image_steps(campaign, campaign.image_flights[0])
+        ap.process(campaign, last="assess")
     return dict(_levels(campaign)), set(_flags(campaign))
 
 

@@ -22,8 +22,8 @@ import xarray as xr
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import create, finish, open_array, open_stage, save_document, writing
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.stages import assess, echo, image, ingest, profile, refine, scene
 from apertura.stages.scene import settled_scene
 
 TILE = 256
@@ -37,19 +37,8 @@ def prepare(root: Path, side: int, receivers: int) -> Campaign:
     third = replace(plan.flights[0].tracks["uav2"], start_m=(start[0] - 3.0, start[1] - 3.6, start[2]))
     over = replace(plan.flights[0], tracks={**plan.flights[0].tracks, "uav3": third})
     nodes = {**plan.nodes, "uav3": plan.nodes["uav2"]}
-    campaign = Campaign.load(simulate(root, replace(plan, nodes=nodes, flights=(over,)), seed=7))
+    campaign = process(simulate(root, replace(plan, nodes=nodes, flights=(over,)), seed=7), last="assess")
     (flight,) = campaign.image_flights
-    for node in flight.nodes:
-        ingest.ingest(campaign, flight.name, node)
-    for pair in flight.pairs:
-        echo.echo(campaign, flight.name, pair)
-    scene.scene(campaign)
-    for pair in flight.pairs:
-        profile.profile(campaign, flight.name, pair)
-    refine.refine(campaign, flight.name)
-    for pair in flight.pairs:
-        image.image(campaign, flight.name, pair)
-    assess.assess(campaign, flight.name)
     settled = json.loads(campaign.result("scene.json").read_text())
     settled["grid"]["shape"] = [side, side]
     save_document(campaign.result("scene.json"), settled)

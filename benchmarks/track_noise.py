@@ -23,7 +23,7 @@ from spoiling.of_logs import logs, noisy
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
-from apertura.stages import echo, image, ingest, profile, refine, scene
+from apertura.run.process import process
 from apertura.stages.scene import settled_scene
 
 SIZES_CM = (0.0, 0.5, 1.0, 2.0, 4.0)
@@ -102,16 +102,7 @@ def _imaged(root: Path) -> list[tuple[str, dict, float, Peaks]]:
     campaign, places = Campaign.load(root), true_places(root)
     flight, images = campaign.image_flights[0], []
     with contextlib.redirect_stdout(io.StringIO()):
-        for node in flight.nodes:
-            ingest.ingest(campaign, flight.name, node)
-        for pair in flight.pairs:
-            echo.echo(campaign, flight.name, pair)
-        scene.scene(campaign)
-        for pair in flight.pairs:
-            profile.profile(campaign, flight.name, pair)
-        refine.refine(campaign, flight.name)
-        for pair in flight.pairs:
-            image.image(campaign, flight.name, pair)
+        process(campaign, last="image")
     for pair in flight.pairs:
         stage = open_stage(campaign.stage("image", flight.name, pair), "image")
         quality = stage.attrs["quality"]

@@ -19,9 +19,9 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import window_weights
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.run.process import process
 from apertura.simulation import Impairments, PulseSpecification, WaveformSpecification, preset, simulate
 from apertura.simulation.targets import PointTarget
-from apertura.stages import echo, image, ingest, profile, refine, scene
 from apertura.stages.scene import open_scene
 
 PULSE = {"carrier_hz": 1.4048e9, "pulse_s": 1e-6, "listen_s": 0.78125e-6, "sample_rate_hz": 1.024e9, "prf_hz": 20.0}
@@ -46,18 +46,11 @@ def run(waveform, targets, snr_db: float | None) -> tuple[Campaign, float]:
     quiet = {"uav1": own, "uav2": own}
     simulate(root, preset("demo", pulses=PULSES), waveform=waveform, targets=targets, impairments=quiet)
     campaign = Campaign.load(root)
-    for node in ("uav1", "uav2"):
-        ingest.ingest(campaign, "f01", node)
+    process(campaign, last="ingest")
     start_s = time.process_time()
-    for pair in PAIRS:
-        echo.echo(campaign, "f01", pair)
+    process(campaign, first="echo", last="echo")
     seconds = time.process_time() - start_s
-    scene.scene(campaign)
-    for pair in PAIRS:
-        profile.profile(campaign, "f01", pair)
-    refine.refine(campaign, "f01")
-    for pair in PAIRS:
-        image.image(campaign, "f01", pair, threads=2)
+    process(campaign, first="scene", last="image", threads=2)
     return campaign, seconds
 
 

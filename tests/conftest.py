@@ -119,12 +119,13 @@ def tiny(_tiny, tmp_path):
 @pytest.fixture(scope="session")
 def all_steps(made_once):
     """Return a function that runs all steps on a copy of a campaign folder, cached by name; read only."""
-    from folders import copy_writable, run_steps
+    from folders import copy_writable
 
     from apertura.campaign.folder import Campaign
+    from apertura.run.process import process
 
     def made(name, source):
-        return Campaign.load(made_once(name, lambda root: run_steps(copy_writable(source, root))))
+        return Campaign.load(made_once(name, lambda root: process(copy_writable(source, root))))
 
     return made
 

@@ -16,7 +16,6 @@ import rasterio
 import yaml
 from rasterio.transform import from_origin
 
-from apertura.campaign.config import FUSED, SampledWaveform
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.check.examination import Examination
@@ -41,29 +40,11 @@ from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.simulation.specification import DrawnCampaign, draw_campaign
 from apertura.simulation.targets import scatterers
 from apertura.stages import (
-    assess,
-    change,
-    coverage,
-    cube,
-    echo,
-    export,
-    image,
-    ingest,
-    interferogram,
-    layers,
-    mosaic,
-    profile,
-    refine,
-    ro_crate,
     scene,
-    stac,
-    stack,
-    tracks,
 )
 from apertura.stages.pair import open_pair
 from apertura.stages.planning import gated, plan_pair
 from apertura.views.plan import first_flight
-from apertura.views.webmap import document as webmap
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
@@ -92,79 +73,8 @@ def expected_plan(campaign: Campaign, flight: str, pair: str) -> Plan:
     return plan_pair(campaign, gated(campaign, open_pair(campaign, flight, pair), ground), ground)
 
 
-def settle_ground(campaign: Campaign) -> None:
-    """Run the steps between the echo and profile steps."""
-    scene.scene(campaign)
-    if campaign.settings.scene.dem:
-        scene.terrain(campaign)
-
-
-def ingest_all(campaign: Campaign) -> None:
-    """Ingest the recordings of both nodes of flight f01."""
-    for node in ("uav1", "uav2"):
-        ingest.ingest(campaign, "f01", node)
-
-
-def make_images(campaign: Campaign, flight: str) -> None:
-    """Run the steps between the scene grid and the images of a flight."""
-    pairs = campaign.flight(flight).pairs
-    for pair in pairs:
-        profile.profile(campaign, flight, pair)
-    refine.refine(campaign, flight)
-    for pair in pairs:
-        image.image(campaign, flight, pair, threads=2)
-
-
 STAND_ON_ALL = frozenset({"mosaic", "map", "stac", "ro_crate"})
 """Results that depend on all images of a campaign."""
-
-
-def export_flight(campaign: Campaign, flight: str) -> None:
-    """Write the exports of a flight: rasters and tracks."""
-    for pair in campaign.flight(flight).pairs:
-        layers.layers(campaign, flight, pair, threads=2)
-        export.export(campaign, flight, pair)
-    if FUSED in campaign.flight(flight).images:
-        export.export_fused(campaign, flight)
-    tracks.tracks(campaign, flight)
-
-
-def relate_images(campaign: Campaign) -> None:
-    """Run the steps that relate images: interferograms and the stack."""
-    for name in campaign.settings.interferometry.pairs:
-        interferogram.interferogram(campaign, name)
-    if requested := campaign.settings.stack:
-        for name in requested.all_flights:
-            stack.stack_image(campaign, name)
-        stack.stack(campaign)
-        for name in requested.flights:
-            change.change(campaign, name)
-
-
-def run_steps(root: Path, *, exports: bool = True) -> Campaign:
-    """Run every step of a campaign in this process, in the order of the workflow."""
-    campaign = Campaign.load(root)
-    for flight in campaign.image_flights:
-        if isinstance(campaign.settings.waveform, SampledWaveform):
-            for node in flight.recorded:
-                ingest.ingest(campaign, flight.name, node)
-        for pair in flight.pairs:
-            echo.echo(campaign, flight.name, pair)
-    settle_ground(campaign)
-    for flight in campaign.image_flights:
-        make_images(campaign, flight.name)
-        assess.assess(campaign, flight.name)
-    cube.cube(campaign)
-    if exports:
-        for flight in campaign.image_flights:
-            export_flight(campaign, flight.name)
-        coverage.coverage(campaign)
-        relate_images(campaign)
-        mosaic.mosaic(campaign)
-        webmap.webmap(campaign)
-        stac.stac(campaign)
-        ro_crate.ro_crate(campaign)
-    return campaign
 
 
 def quality_of(campaign: Campaign, pair: str) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import complaint, contents, copy_writable, ingest_all, make_images, settle_ground, state
+from folders import complaint, contents, copy_writable, state
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -16,6 +16,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.range_profiles import CompressionError, range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Clock
 from apertura.stages import echo, transfer
@@ -32,7 +33,7 @@ def drifting(tmp_path_factory):
     plan = replace(preset("demo", pulses=90), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     changed = {"uav2": replace(plan.nodes["uav2"].impairments, clock=Clock(cfo_hz=12e3, sfo_hz=1e3))}
     root = simulate(tmp_path_factory.mktemp("drifting") / "campaign", plan, impairments=changed, seed=5)
-    ingest_all(Campaign.load(root))
+    process(Campaign.load(root), last="ingest")
     return root
 
 
@@ -96,8 +97,8 @@ def test_images_from_stored_transfer_equal_those_of_recordings(drifting, tmp_pat
         if lost:
             for path in (campaign.root / "raw/f01").glob("*.sigmf-data"):
                 path.unlink()
-        settle_ground(campaign)
-        make_images(campaign, "f01")
+        process(campaign, first="scene", last="terrain")
+        process(campaign, first="profile", last="image")
         results.append({name: data for name, data in contents(campaign.results).items() if not name.startswith(".")})
     assert results[0] == results[1]
 

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import image_of, run_steps, state
+from folders import image_of, state
 from test_32_interference import FREQUENCY, WEIGHT, noise_floor_db, profiles, received
 
 from apertura.campaign.store import open_stage
 from apertura.core.echo.captures import sampled_pulses
 from apertura.core.echo.interference import Interference, NoisyPulses, PulsedInterference, SidelinkInterference, limited
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Adc, Interferer
 from apertura.stages.transfer import PairEcho
@@ -218,7 +219,7 @@ def campaign_with(root, *sources, setting="auto"):
     }
     simulate(root, replace(plan, nodes=nodes), seed=7)
     state(root, "processing", interference=setting, autofocus="off")
-    return run_steps(root, exports=False)
+    return process(root, last="cube")
 
 
 def attributes(campaign, pair):

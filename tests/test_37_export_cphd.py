@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import sarkit.verification
 import yaml
-from folders import edit_config, make_images, settle_ground
+from folders import edit_config
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -17,6 +17,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.formats.reading import read_phase_history
+from apertura.run.process import process
 from apertura.stages import cphd, echo, tracks
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import on_demand, results_of
@@ -54,8 +55,8 @@ def reimported(campaign, flight, pair, target):
     (target / "config/flights.tsv").write_text(f"flight\tkind\ttransmitter\tnodes\n{flight}\timage\t{tx}\t{rx}\n")
     again = Campaign.load(target)
     echo.echo(again, flight, pair)
-    settle_ground(again)
-    make_images(again, flight)
+    process(again, first="scene", last="terrain")
+    process(again, first="profile", last="image")
     return again
 
 
@@ -83,8 +84,8 @@ def gotcha(shared, tmp_path_factory):
     (root / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\npass1\timage\tradar\tradar\n")
     campaign = Campaign.load(root)
     echo.echo(campaign, "pass1", "radar-radar")
-    settle_ground(campaign)
-    make_images(campaign, "pass1")
+    process(campaign, first="scene", last="terrain")
+    process(campaign, first="profile", last="image")
     return campaign
 
 
@@ -115,16 +116,18 @@ def test_gotcha_image_through_cphd_differs_by_less_than_minus_80_db(gotcha, tmp_
 @pytest.fixture(scope="module")
 def fine_tiny(_tiny, tmp_path_factory):
     """Process the pairs of the tiny campaign at the accuracy of the comparison."""
-    from folders import copy_writable, ingest_all
+    from folders import copy_writable
+
+    from apertura.run.process import process
 
     root = copy_writable(_tiny, tmp_path_factory.mktemp("tiny") / "campaign")
     edit_config(root, lambda config: config.update(processing={"autofocus": "off", "accuracy_db": -90.0}))
     campaign = Campaign.load(root)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     for pair in campaign.flight("f01").pairs:
         echo.echo(campaign, "f01", pair)
-    settle_ground(campaign)
-    make_images(campaign, "f01")
+    process(campaign, first="scene", last="terrain")
+    process(campaign, first="profile", last="image")
     return campaign
 
 

@@ -21,10 +21,11 @@ from apertura_research.paper.fusion import (
     two_segment_sidelobe_db,
 )
 from apertura_research.paper.losses import ERRORS
-from folders import recordings_of, run_steps
+from folders import recordings_of
 
 from apertura.campaign.folder import Campaign
 from apertura.core.quality.measures import coherence_factor
+from apertura.run.process import process
 from apertura.simulation import preset, simulate
 from apertura.simulation.presets import GAP_M, SEGMENT_M
 from apertura.stages import echo, ingest
@@ -180,7 +181,7 @@ def test_clutter_is_measured_away_from_every_target():
 
 
 def test_processed_flight_gives_the_predicted_fusion_results(tmp_path):
-    run_steps(simulate(tmp_path / "uav", "paper-uav"), exports=False)
+    process(simulate(tmp_path / "uav", "paper-uav"), last="cube")
     claims = {claim.claim: claim for claim in fusion_claims(tmp_path)}
     suppression = claims.pop("clutter suppression by the coherent sum over that by the noncoherent one")
     assert (suppression.about, suppression.verdict) == (PAPER, DISAGREES)

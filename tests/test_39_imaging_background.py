@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from folders import ROOT, copy_writable, run_steps, state
+from folders import ROOT, copy_writable, state
 from scenes import monostatic, straight_track
 
 import apertura as ap
@@ -23,6 +23,7 @@ from apertura.core.imaging.background import BackgroundScene, decide_removal, st
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Leakage
 from apertura.stages import profile
@@ -227,7 +228,7 @@ def leaking(tmp_path_factory):
     simulate(folder / "auto", replace(plan, nodes=nodes), seed=7)
     state(copy_writable(folder / "auto", folder / "none"), "processing", background="none")
     for name in ("auto", "none"):
-        run_steps(folder / name)
+        process(folder / name)
     return {name: Campaign.load(folder / name) for name in ("auto", "none")}
 
 
@@ -255,7 +256,7 @@ def test_reflector_of_a_real_flight_is_the_highest_peak_at_its_survey_point(shar
     (root / "raw" / "f01").mkdir(parents=True)
     for name in ("radar.out", "radar.track.csv"):
         shutil.copyfile(shared / "bwsi_uav_flight" / name, root / "raw" / "f01" / name)
-    run_steps(root)
+    process(root)
     stage = open_stage(Campaign.load(root).stage("image", "f01", "radar-radar"), "image")
     power = np.abs(stage.image.values) ** 2
     row, column = np.unravel_index(np.nanargmax(power), power.shape)

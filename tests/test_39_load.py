@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
-from folders import complaint, copy_writable, edit_config, ingest_all
+from folders import complaint, copy_writable, edit_config
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import record_files
 from apertura.common.errors import CampaignError
+from apertura.run.process import process
 from apertura.stages import echo, scene
 from apertura.stages.pair import open_pair
 from apertura.stages.scene import expected_scene, settled_scene
@@ -105,7 +106,7 @@ def test_planned_grid_equals_the_grid_of_the_workflow(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m="auto", spacing_m="auto"))
     campaign = Campaign.load(tiny)
     expected = expected_scene(campaign, lambda: first_flight(campaign)).grid
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     for pair in ("uav1-uav1", "uav1-uav2"):
         echo.echo(campaign, "f01", pair)
     scene.scene(campaign)
@@ -118,7 +119,7 @@ def test_path_limit_of_the_prefix_equals_the_planned_one(tiny, pair):
     """The prefix may limit automatic bounds: path offsets and sidelink length are included even without an echo."""
     campaign = Campaign.load(tiny)
     expected_m = open_pair(campaign, "f01", pair).path_limit_m
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     echo.echo(campaign, "f01", pair)
     assert open_pair(campaign, "f01", pair).path_limit_m == pytest.approx(expected_m, abs=0.05)
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import ingest_all
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
+from apertura.run.process import process
 from apertura.simulation import preset, simulate
 from apertura.stages import echo
 from apertura.stages.pair import open_pair
@@ -26,7 +26,7 @@ LINES = (
 def cut(tiny) -> Campaign:
     (tiny / "config" / "segments.tsv").write_text(HEADING + LINES)
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     return campaign
 
 

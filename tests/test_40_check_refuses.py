@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import rasterio
-from folders import edit_config, edit_meta, edit_track, run_steps, state
+from folders import edit_config, edit_meta, edit_track, state
 from rasterio.transform import from_origin
 
 from apertura.campaign.folder import Campaign
 from apertura.check import problems
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import map_from_frame
+from apertura.run.process import process
 from apertura.stages.node_log import read_log
 
 
@@ -107,7 +108,7 @@ def test_check_reports_errors_of_a_run_with_the_same_message(tiny, name, monkeyp
     before = [(problem.found, problem.expected, problem.remedy) for problem in problems(tiny)]
     assert any(message in " ".join(parts) for parts in before), before
     with pytest.raises(CampaignError) as caught:
-        run_steps(tiny, exports=False)
+        process(tiny, last="cube")
     if name not in {"no pulse in a segment", "a DEM not below the track"}:  # a run counts only the remaining pulses
         assert (caught.value.found, caught.value.expected, caught.value.remedy) in before
 

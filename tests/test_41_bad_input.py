@@ -5,10 +5,11 @@ import json
 
 import numpy as np
 import pytest
-from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all, require_files
+from folders import complaint, edit_config, edit_data, edit_meta, edit_track, require_files
 
 from apertura.campaign.folder import Campaign
 from apertura.formats.recordings.sample_file import SampleFile
+from apertura.run.process import process
 from apertura.stages import echo, ingest, profile, scene
 from apertura.stages.pair import open_pair
 
@@ -76,7 +77,7 @@ def test_capture_past_the_end_is_reported(tiny):
 def test_track_that_ends_early_is_reported_with_the_seconds(tiny):
     edit_track(tiny, "uav1", lambda lines: lines[:25])
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
     last = np.datetime64(next((tiny / "raw/f01").glob("uav1.track.csv")).read_text().splitlines()[-1][:23])
     meta = json.loads((tiny / "raw/f01/uav1.sigmf-meta").read_text())
@@ -88,7 +89,7 @@ def test_track_that_ends_early_is_reported_with_the_seconds(tiny):
 def test_gpst_log_taken_for_utc_is_reported_with_18_seconds(tiny):
     edit_track(tiny, "uav2", lambda lines: [line.replace("GPST", "UTC ") for line in lines])
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
     assert "starts 1" in message
     assert "GPST is 18 s ahead" in message
@@ -119,7 +120,7 @@ def test_lever_arm_with_a_log_without_attitude_is_refused(tiny):
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(attitude="log"))
     edit_track(tiny, "uav1", lambda lines: [",".join(line.split(",")[:4]) for line in lines])
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
     assert "the attitude is unknown" in message
     assert message.startswith("raw/f01/uav1.track.csv")
@@ -127,7 +128,7 @@ def test_lever_arm_with_a_log_without_attitude_is_refused(tiny):
 
 def test_wrong_carrier_is_reported_with_the_recording(tiny):
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     edit_config(tiny, lambda document: document["waveform"].update(carrier_hz=1.3e9))
     message = complaint(lambda: echo.echo(Campaign.load(tiny), "f01", "uav1-uav1"))
     assert message.startswith("raw/f01/uav1.sigmf-data and raw/f01/uav1.sigmf-meta: recorded with carrier_hz")
@@ -155,7 +156,7 @@ def test_beam_with_a_log_without_attitude_is_refused(tiny):
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m=zero))
     edit_track(tiny, "uav1", lambda lines: [",".join(line.split(",")[:4]) for line in lines])
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
     assert "an antenna beam is configured, but the attitude is unknown (attitude: log)" in message
 
@@ -279,7 +280,7 @@ def test_nan_position_is_reported(tiny):
 def test_scene_beyond_the_cyclic_prefix_is_refused_with_its_shortest_path(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(cyclic_prefix_s=20 / 1.024e9))
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     echo.echo(campaign, "f01", "uav1-uav1")
     scene.scene(campaign)
     message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
@@ -291,7 +292,7 @@ def test_scene_beyond_the_cyclic_prefix_is_refused_with_its_shortest_path(tiny):
 def test_path_offset_can_move_echoes_beyond_the_prefix(tiny):
     edit_config(tiny, lambda document: document["nodes"]["uav1"]["path_offset_m"].update(radar=230.0))
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     echo.echo(campaign, "f01", "uav1-uav1")
     scene.scene(campaign)
     assert "cyclic prefix" in complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
@@ -300,7 +301,7 @@ def test_path_offset_can_move_echoes_beyond_the_prefix(tiny):
 def test_codes_of_the_wrong_length_are_refused(tiny):
     np.save(tiny / "raw" / "codes.npy", np.ones(1000, np.complex64))
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
     assert "raw/codes.npy" in message
     assert "(1000,)" in message
@@ -314,7 +315,7 @@ def test_nodes_without_common_pulses_are_refused(tiny):
 
     edit_meta(tiny, "uav2", an_hour_later)
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
     assert "half a repetition interval" in message
     assert "uav2" in message
@@ -323,7 +324,7 @@ def test_nodes_without_common_pulses_are_refused(tiny):
 def test_secondary_without_sidelink_is_refused(tiny):
     edit_meta(tiny, "uav2", lambda meta: meta["global"].update({"apertura:channels": ["radar", "spare"]}))
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
     assert "a channel named 'sidelink'" in message
 
@@ -331,7 +332,7 @@ def test_secondary_without_sidelink_is_refused(tiny):
 def test_node_with_another_sample_rate_is_refused(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(sample_rate_hz=512e6))
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     assert "sample_rate_hz" in complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
 
 
@@ -374,7 +375,7 @@ def test_segments_without_pulses_are_reported_with_recorded_times(tiny):
     line = "f01\tuav1-uav1\t2025-05-14T10:30:00\t2025-05-14T10:30:01"
     (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\n{line}\n")
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     for read in (echo.echo, open_pair):
         message = complaint(lambda read=read: read(campaign, "f01", "uav1-uav1"))
         assert "no pulse of flight f01, pair uav1-uav1 within 2025-05-14T10:30:00" in message
@@ -386,7 +387,7 @@ def test_segments_without_pulses_are_reported_with_recorded_times(tiny):
 def test_recording_changed_since_ingestion_is_refused(tiny):
     """The raw stage refers to the file of the recorder by its hash; samples are not copied."""
     campaign = Campaign.load(tiny)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     stage = tiny / "results/f01/uav1/raw.zarr"
     stage_bytes = sum(path.stat().st_size for path in stage.rglob("*") if path.is_file())
     assert stage_bytes < 20_000 < (tiny / "raw/f01/uav1.sigmf-data").stat().st_size

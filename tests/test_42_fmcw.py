@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from folders import ROOT, complaint, edit_config, run_steps
+from folders import ROOT, complaint, edit_config
 
 from apertura.campaign.config import validated
 from apertura.campaign.folder import Campaign
@@ -16,6 +16,7 @@ from apertura.check import problems
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.core.quality.point_targets import find_peak
+from apertura.run.process import process
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 from apertura.stages.scene import open_scene
 from apertura.stages.transfer import recorded_echo
@@ -74,7 +75,7 @@ def test_target_position_errors_are_below_a_centimetre(tmp_path, sweep):
     flight = replace(FLIGHT, sweep=sweep)
     root = write_campaign(tmp_path, flight)
     assert problems(root) == []
-    run_steps(root, exports=False)
+    process(root, last="cube")
     error_m, heights = error_and_magnitudes(root, flight)
     assert error_m < 0.01
     assert heights == pytest.approx(1.0, abs=0.05)
@@ -109,7 +110,7 @@ def test_impossible_sweep_is_refused_by_its_key(tmp_path, changes, message):
 def test_second_node_on_the_same_clock_images_the_same_targets(tmp_path):
     flight = replace(FLIGHT, nodes={"uav1": (0.0, -20.0, 10.0), "uav2": (3.0, -21.0, 11.0)})
     root = write_campaign(tmp_path, flight)
-    run_steps(root, exports=False)
+    process(root, last="cube")
     for pair in ("uav1-uav1", "uav1-uav2"):
         error_m, heights = error_and_magnitudes(root, flight, pair)
         assert error_m < 0.01
@@ -128,13 +129,13 @@ def test_residual_video_phase_displaces_a_far_target_as_predicted(tmp_path, monk
         half_width_m=2.0,
     )
     root = write_campaign(tmp_path, flight)
-    run_steps(root, exports=False)
+    process(root, last="cube")
     assert error_and_magnitudes(root, flight)[0] < 0.01
     monkeypatch.setattr(
         "apertura.formats.phase_histories.fmcw.transfer_of", functools.partial(transfer_of, deskewed=False)
     )
     uncorrected = write_campaign(tmp_path / "uncorrected", flight)
-    run_steps(uncorrected, exports=False)
+    process(uncorrected, last="cube")
     delay_s = 2 * np.linalg.norm(np.subtract(flight.targets[0], (0.0, -60.0, 10.0))) / SPEED_OF_LIGHT_M_S
     displacement_m = east * FAST.slope_hz_s * delay_s / 2.4e9
     assert displacement_m > 0.04
@@ -145,7 +146,7 @@ def test_residual_video_phase_displaces_a_far_target_as_predicted(tmp_path, monk
 def test_mixer_of_opposite_sign_is_flagged(tmp_path):
     flight = replace(FLIGHT, sweep=replace(FAST, iq="complex"))
     root = write_campaign(tmp_path, flight, iq="conjugate")
-    run_steps(root, exports=False)
+    process(root, last="cube")
     flags = image_of(root).attrs["quality"]["flags"]
     assert {"echo_outside_scene", "defocused"} & set(flags)
     assert any("change waveform.iq from complex to conjugate or vice versa" in line for line in flags.values())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import yaml
-from folders import complaint, edit_config, run_steps
+from folders import complaint, edit_config
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -15,6 +15,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
 from apertura.formats.names import PHASE_HISTORIES, HistoryFormat
 from apertura.formats.tracks.csv_track import read_csv_track
+from apertura.run.process import process
 from apertura.stages import tracks
 from apertura.tools.preview.follow import Preview
 
@@ -100,7 +101,7 @@ def brightest(root):
 def test_clock_offset_puts_the_target_at_its_position(campaign):
     write_clocks(campaign)
     assert problems(campaign) == []
-    run_steps(campaign, exports=False)
+    process(campaign, last="cube")
     east, north, peak = brightest(campaign)
     assert (east, north) == (1.0, 20.0)
     assert peak > 0.97
@@ -113,7 +114,7 @@ def test_clock_offset_puts_the_target_at_its_position(campaign):
 def test_refined_tracks_of_a_phase_history_are_written(campaign):
     write_clocks(campaign)
     edit_config(campaign, lambda document: document.update(processing={"autofocus": "off"}))
-    opened = run_steps(campaign, exports=False)
+    opened = process(campaign, last="cube")
     written = {path.name for path in tracks.tracks(opened, "f01")}
     assert written == {"uav1.csv", "uav1.pos", "tracks.png"}
     read, log = (read_csv_track(path, node="uav1") for path in (
@@ -130,21 +131,21 @@ def test_phase_history_of_opposite_sign_is_imaged_with_iq_conjugate(campaign):
     stored = dict(np.load(file))
     np.savez(file, **stored | {"transfer": stored["transfer"].conj()})
     edit_config(campaign, lambda document: document["waveform"].update(iq="conjugate"))
-    run_steps(campaign, exports=False)
+    process(campaign, last="cube")
     assert brightest(campaign)[:2] == (1.0, 20.0)
 
 
 @pytest.mark.slow
 def test_clock_error_displaces_the_target_along_the_track(campaign):
     write_clocks(campaign, CLOCK_OFFSET_S + 0.5)
-    run_steps(campaign, exports=False)
+    process(campaign, last="cube")
     assert abs(brightest(campaign)[0] - 1.5) < 0.25
 
 
 @pytest.mark.slow
 def test_uncertainty_of_a_clock_offset_is_in_the_budget(campaign):
     write_clocks(campaign, std_s=0.05)
-    run_steps(campaign, exports=False)
+    process(campaign, last="cube")
     quality = open_stage(Campaign.load(campaign).stage("image", "f01", "uav1-uav1"), "image").attrs["quality"]
     tags = next(line for line in quality["budget"] if line["cause"] == "time tags")
     assert tags["stated"].startswith("50 ms")
@@ -168,7 +169,7 @@ def test_track_at_terrain_height_is_refused_before_the_run(campaign):
 
 
 def test_log_that_misses_pulses_is_reported_with_the_clock_remedy(campaign):
-    message = complaint(lambda: run_steps(campaign, exports=False))
+    message = complaint(lambda: process(campaign, last="cube"))
     assert "starts 3.440 s after the first pulse" in message
     assert "apertura align" in message
 
@@ -190,7 +191,7 @@ def test_invalid_line_of_clocks_is_reported(campaign, cells, expected):
 
 def test_samples_without_positions_are_refused(campaign):
     (campaign / "raw/f01/uav1.track.csv").unlink()
-    message = complaint(lambda: run_steps(campaign, exports=False))
+    message = complaint(lambda: process(campaign, last="cube"))
     assert "samples without positions" in message
 
 

@@ -5,7 +5,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, quality_of, run_steps, state
+from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, quality_of, state
 from spoiling.logs import read_log, write_log
 from spoiling.of_logs import noisy
 from track_noise import declare_std
@@ -16,6 +16,7 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.methods.autofocus.one_phase import METHODS, MOST_LOSS_DB, SpaceVariance
 from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, PointTarget, SimulatedFlight, Straight, preset, simulate
 from apertura.stages import refine
 from apertura.stages.pair import open_pair
@@ -57,7 +58,7 @@ def campaigns(tmp_path_factory):
         write_log(path, log if log.attitude_deg is not None else declare_std(0.02)(log))
     edit_config(corrected, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
     state(right, "processing", autofocus="off")
-    return {root.name: run_steps(root, exports=root is corrected) for root in (right, corrected)}
+    return {root.name: process(root, last="" if root is corrected else "cube") for root in (right, corrected)}
 
 
 def opened(campaign):

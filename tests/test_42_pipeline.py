@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import rasterio
-from folders import copy_writable, run_steps
+from folders import copy_writable
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -16,6 +16,7 @@ from apertura.core.echo.sidelink import METHODS
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.measures import numerical_error_db
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
+from apertura.run.process import process
 from apertura.stages import echo
 from apertura.stages.scene import open_scene
 from apertura.stages.transfer import PairEcho
@@ -109,7 +110,7 @@ def test_gotcha_trihedrals_focus_within_30_cm(shared, tmp_path):
         "scene: {crs: local, bounds_m: [-40.0, 10.0, 0.0, 50.0], spacing_m: 0.2}\n"
     )
     (root / "config" / "flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\npass1\timage\tradar\tradar\n")
-    campaign = run_steps(root)
+    campaign = process(root)
     with rasterio.open(root / "results/pass1/radar-radar/slc.tif") as raster:
         image, crs = raster.read(1), raster.crs
     assert crs.to_wkt().startswith('LOCAL_CS["gotcha"')
@@ -164,7 +165,7 @@ def test_stated_numerical_error_is_confirmed(finished_tiny):
 
 @pytest.mark.slow
 def test_two_runs_write_identical_bytes(tiny, finished_tiny):
-    run_steps(tiny)
+    process(tiny)
     products = sorted(
         path for path in finished_tiny.results.rglob("*") if path.suffix in {".tif", ".png", ".qml", ".vrt", ".geojson"}
     )
@@ -181,7 +182,7 @@ def test_two_runs_write_identical_bytes(tiny, finished_tiny):
 @pytest.mark.slow
 def test_thread_count_does_not_change_the_image(tiny, finished_tiny):
     campaign = Campaign.load(tiny)
-    run_steps(tiny, exports=False)
+    process(tiny, last="cube")
     from apertura.stages import image
 
     image.image(campaign, "f01", "uav1-uav1", threads=6)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, ingest_all, quality_of, run_steps, state
+from folders import STAND_ON_ALL, copy_writable, edit_config, image_of, quality_of, state
 from judging.bases import curved
 from spoiling.logs import read_log, write_log
 from spoiling.of_logs import late, noisy
@@ -22,8 +22,9 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.decisions import TOLERATED_LOSS_DB, decide_autofocus
 from apertura.core.planning.plan import Decision
 from apertura.methods.autofocus.inputs import PairRecord, Refinement
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.stages import echo, image, profile, refine, scene, tracks
+from apertura.stages import image, refine, tracks
 from apertura.stages.acquisition import open_acquisition
 from apertura.stages.hypotheses import subset_geometry, with_logs
 from apertura.stages.pair import open_pair
@@ -39,16 +40,6 @@ from apertura.workflow.stale import stale_results
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 DECISIONS = (Decision("autofocus", "on", "requested"), Decision("autofocus_method", "tracks", "requested"))
-
-
-def run_steps_before_image(campaign):
-    """Run the steps before image formation for the first flight."""
-    ingest_all(campaign)
-    for pair in PAIRS:
-        echo.echo(campaign, "f01", pair)
-    scene.scene(campaign)
-    for pair in PAIRS:
-        profile.profile(campaign, "f01", pair)
 
 
 @pytest.mark.slow
@@ -101,7 +92,7 @@ def erroneous(finished_tiny, tmp_path_factory):
     moved = log.moved(error_m)
     write_log(path, moved)
     campaign = Campaign.load(root)
-    run_steps_before_image(campaign)
+    process(campaign, last="profile")
     back_m = ecef_from_geodetic(*log.geodetic.T) - ecef_from_geodetic(*moved.geodetic.T)
     return campaign, (log.begun, TrackCorrection(log.time_s, {"uav1": back_m, "uav2": np.zeros_like(back_m)}))
 
@@ -169,7 +160,7 @@ def test_delivered_refined_logs_give_the_same_images(erroneous, tmp_path):
         )
     for root in (logged, delivered):
         off = state(root, "processing", autofocus="off")
-        run_steps_before_image(off)
+        process(off, last="profile")
         refine.refine(off, "f01")
     for pair in PAIRS:
         images = []
@@ -252,7 +243,7 @@ def campaign_to_refine(folder, *, pulses, half_m, std_m=0.0, stated_m=0.02):
     root = simulate(folder / "campaign", plan, seed=7)
     add_noise(root, std_m, stated_m)
     campaign = state(root, "processing", autofocus="on")
-    run_steps_before_image(campaign)
+    process(campaign, last="profile")
     return campaign
 
 
@@ -309,7 +300,7 @@ def test_log_errors_of_2_cm_are_refined_automatically(tmp_path):
     loss_of = {}
     for name, root in (("off", copy_writable(erroneous, tmp_path / "off")), ("auto", erroneous)):
         state(root, "processing", autofocus=name)
-        campaign = run_steps(root)
+        campaign = process(root)
         loss_of[name] = {pair: quality_of(campaign, pair)["focus"]["loss_db"] for pair in PAIRS}
         worst_m = max(one.error_m for one in score(campaign))
     for pair in PAIRS:
@@ -375,7 +366,7 @@ def test_delayed_log_is_identified_and_corrected(tmp_path):
     write_log(path, late(0.1)(read_log(path)))
     accuracy = {"position_std_m": 0.01}
     edit_config(campaign.root, lambda document: [node.update(accuracy) for node in document["nodes"].values()])
-    campaign = run_steps(campaign.root)
+    campaign = process(campaign.root)
     attrs = open_refined(campaign, "f01").stage.attrs
     assert list(attrs["flags"]) == ["cause_corrected"]
     assert attrs["report"]["cause"]["what"].startswith("the times of the log of uav1 are ")

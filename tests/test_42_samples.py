@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from folders import edit_config, run_steps
+from folders import edit_config
 
 from apertura.campaign.config import validated
 from apertura.campaign.folder import Campaign
@@ -16,6 +16,7 @@ from apertura.check import problems
 from apertura.common.errors import CampaignError
 from apertura.core.echo.compression import window_weights
 from apertura.core.quality.point_targets import find_peak
+from apertura.run.process import process
 from apertura.simulation import Impairments, PointTarget, PulseSpecification, preset, read_specification, simulate
 from apertura.simulation.impairments import Timing
 from apertura.simulation.specification import specification_text
@@ -43,7 +44,7 @@ def imaged(request, tmp_path_factory):
     """Image three targets from two nodes with noise, two clocks, missed triggers, random phases and start times."""
     root = tmp_path_factory.mktemp(request.param) / "campaign"
     simulate(root, preset("demo", pulses=150), waveform=PULSES[request.param], targets=TARGETS)
-    return run_steps(root, exports=False)
+    return process(root, last="cube")
 
 
 @pytest.fixture

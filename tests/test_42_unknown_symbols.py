@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import own_campaign
 import pytest
-from folders import edit_config, export_flight, run_steps
+from folders import edit_config
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, read_manifest
@@ -16,6 +16,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.echo.constellation import constellation
 from apertura.core.echo.unknown_symbols import SymbolDecider
 from apertura.core.quality.point_targets import find_peak
+from apertura.run.process import process
 from apertura.simulation import preset, simulate
 from apertura.simulation.impairments import Clock
 from apertura.stages import echo, ingest
@@ -44,7 +45,7 @@ def imaged(tmp_path_factory):
     """Image the campaign of 16-QAM frames that was computed apart from the simulator, with a sidelink of 15 dB."""
     root = tmp_path_factory.mktemp("own") / "campaign"
     truth = own_campaign.write(root)
-    return run_steps(root, exports=False), truth
+    return process(root, last="cube"), truth
 
 
 def assert_focused(image, grid, truth):
@@ -169,7 +170,7 @@ def test_expected_frame_errors_are_the_mean_over_frames(tmp_path):
 def test_report_shows_the_payload_without_decoding_it_again(imaged, monkeypatch):
     """The page of a flight with frames depends on the payload, shows its plot, and the error rates of both limits."""
     campaign = imaged[0]
-    export_flight(campaign, "f01")
+    process(campaign, first="layers", last="export_fused")
     for pair in PAIRS:
         pictures(campaign, "f01", pair)
     pictures_fused(campaign, "f01")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from folders import complaint, copy_writable, image_of, run_steps, state
+from folders import complaint, copy_writable, image_of, state
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -14,6 +14,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.atmosphere import Atmosphere, standard_weather
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 from apertura.core.quality.point_targets import find_peak
+from apertura.run.process import process
 from apertura.simulation import PointTarget, SimulatedNode, Straight, WaveformSpecification, preset, simulate
 from apertura.simulation.impairments import Impairments
 from apertura.stages.node_log import raw_log
@@ -191,7 +192,7 @@ def test_configured_atmosphere_puts_targets_at_their_positions(flown, tmp_path):
     for name, air in (("stated", {"refractivity_n": warm}), ("auto", "auto"), ("vacuum", "vacuum")):
         copy = copy_writable(root, tmp_path / name)
         state(copy, "scene", atmosphere=air)
-        campaign = run_steps(copy)
+        campaign = process(copy)
         reports = {pair: json.loads((campaign.results / f"f01/{pair}/image.json").read_text()) for pair in pairs}
         budget = next(line for line in reports["uav1-uav1"]["budget"] if line["cause"] == "atmosphere")
         fused = json.loads((campaign.results / "f01/fused/image.json").read_text())

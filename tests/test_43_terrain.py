@@ -11,18 +11,7 @@ import pytest
 import rasterio
 import xarray as xr
 import yaml
-from folders import (
-    ALONG,
-    SLOPE,
-    UPHILL,
-    complaint,
-    copy_writable,
-    expected_plan,
-    require_files,
-    run_steps,
-    settle_ground,
-    write_plane,
-)
+from folders import ALONG, SLOPE, UPHILL, complaint, copy_writable, expected_plan, require_files, write_plane
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -32,6 +21,7 @@ from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.simulation.targets import PointTarget
@@ -64,7 +54,7 @@ def hillside(tmp_path_factory):
     root = simulate(tmp_path_factory.mktemp("hillside") / "campaign", plan, targets=targets, seed=7)
     write_plane(root)
     edit_scene(root, dem="dem.tif", dem_datum="ellipsoid")
-    return run_steps(root)
+    return process(root)
 
 
 @pytest.mark.slow
@@ -79,7 +69,7 @@ def test_flat_terrain_displaces_targets_of_a_hillside(hillside, tmp_path):
     root = copy_writable(hillside.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     edit_scene(root, dem=None, dem_datum=None)
-    findings = score(run_steps(root))
+    findings = score(process(root))
     errors_m = [finding.error_m for finding in findings if finding.target and finding.image == "uav1-uav1"]
     assert min(errors_m) > 0.1
 
@@ -143,7 +133,7 @@ def test_constant_dem_gives_the_image_of_flat_terrain(finished_tiny, tmp_path):
     shutil.rmtree(root / "results")
     write_plane(root, slope=0.0)
     edit_scene(root, dem="dem.tif", dem_datum="ellipsoid", height_m=-99.0)
-    campaign = run_steps(root, exports=False)
+    campaign = process(root, last="cube")
     one, other = (
         open_stage(which.stage("image", "f01", "uav1-uav2"), "image").image.values
         for which in (campaign, finished_tiny)
@@ -212,13 +202,13 @@ def test_void_in_the_scene_is_reported_with_count_and_position(tiny):
     write_plane(tiny, void=np.nan)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
     planned = complaint(lambda: expected_plan(campaign, *PAIR))  # before any step runs
-    message = complaint(lambda: settle_ground(campaign))
+    message = complaint(lambda: process(campaign, first="scene", last="terrain"))
     assert planned == message
     assert "of 3600 pixels" in message
     assert "first at x " in message
     assert not (tiny / "results" / "terrain.zarr").exists()
     write_plane(tiny)  # with the corrected DEM, unfinished work with the old DEM is discarded
-    settle_ground(campaign)
+    process(campaign, first="scene", last="terrain")
     assert np.isfinite(open_stage(campaign.stage("terrain"), "terrain").height.values).all()
 
 
@@ -278,7 +268,7 @@ def test_undeclared_void_is_an_impossible_height(tiny):
     """Values of -9999 without a nodata tag are refused wherever the DEM is first read."""
     write_plane(tiny, void=-9999.0)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    for read in (lambda: expected_plan(campaign, *PAIR), lambda: settle_ground(campaign)):
+    for read in (lambda: expected_plan(campaign, *PAIR), lambda: process(campaign, first="scene", last="terrain")):
         message = complaint(read)
         assert "dem.tif: 1 of the " in message
         assert "impossible heights, most frequently -9999 m" in message
@@ -323,7 +313,7 @@ def test_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path
     assert "flight f01, pair uav1-uav1: at " in planned
     assert "transmitter is at or below the terrain" in planned
     shutil.copytree(str(hillside.results / "f01"), str(root / "results" / "f01"))
-    settle_ground(campaign)
+    process(campaign, first="scene", last="terrain")
     message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
     assert message.split(", worst")[0].split(": at ")[0] == planned.split(": at ")[0]
     assert "transmitter is at or below the terrain" in message

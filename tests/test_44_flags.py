@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import complaint, copy_writable, edit_config, edit_data, ingest_all, quality_of
+from folders import complaint, copy_writable, edit_config, edit_data, quality_of
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import (
     Adc,
@@ -34,7 +35,7 @@ def simulated(folder, node="uav2", *, pulses=40, **impairments):
         root, lambda document: document.update(processing={"autofocus": False})
     )  # autofocus needs both pairs, and only one is imaged
     campaign = Campaign.load(root)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     return campaign
 
 
@@ -216,7 +217,7 @@ def test_other_i_q_order_is_reported_and_configurable(undisturbed, change, order
     expected = {pair: PairEcho.opened(campaign, "f01", pair).stage.transfer.values for pair in pairs}
     for node in ("uav1", "uav2"):
         edit_data(campaign.root.real(), node, change)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     flags = echo_of(campaign, "uav1-uav1").attrs["flags"]
     assert "set waveform.iq to swapped if I and Q are swapped" in flags["spectrum_inverted"]
     lines = [line for text in flags.values() for line in text.split("; ")]
@@ -225,7 +226,7 @@ def test_other_i_q_order_is_reported_and_configurable(undisturbed, change, order
     assert "the conjugate samples contain the code" in message
     edit_config(campaign.root.real(), lambda document: document["waveform"].update(iq=order))
     campaign = Campaign.load(campaign.root)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     for pair, transfer in expected.items():
         stage = echo_of(campaign, pair)
         assert stage.attrs["flags"] == {}
@@ -238,11 +239,11 @@ def test_i_q_order_is_configurable_per_node(undisturbed, change, order):
     campaign, pair = undisturbed, "uav1-uav2"
     expected = PairEcho.opened(campaign, "f01", pair).stage.transfer.values
     edit_data(campaign.root.real(), "uav2", change)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     assert "nodes.<n>.iq" in complaint(lambda: echo_of(campaign, pair))
     edit_config(campaign.root.real(), lambda document: document["nodes"]["uav2"].update(iq=order))
     campaign = Campaign.load(campaign.root)
-    ingest_all(campaign)
+    process(campaign, last="ingest")
     stage = echo_of(campaign, pair)
     assert stage.attrs["flags"] == {}
     np.testing.assert_array_equal(stage.transfer.values, expected)

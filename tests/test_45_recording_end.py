@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
-from folders import image_of, quality_of, run_steps, state
+from folders import image_of, quality_of, state
 from scenes import compiled, monostatic, plan, straight_track
 
 import apertura as ap
@@ -27,6 +27,7 @@ from apertura.core.imaging.resolution import Resolution
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import Looks
 from apertura.core.scene.terrain import FlatGround
+from apertura.run.process import process
 from apertura.simulation.scatterers import transfer
 from apertura.simulation.targets import Scatterers
 from apertura.stages.pair import open_pair
@@ -399,7 +400,7 @@ def test_products_of_a_partly_recorded_campaign(tiny):
     planned = {pair: gated(*opened(tiny, pair)) for pair in ("uav1-uav1", "uav1-uav2")}
     scene = opened(tiny)[2]
     planned_flags = {pair: plan_pair(campaign, each, scene).flags for pair, each in planned.items()}
-    campaign = run_steps(tiny)
+    campaign = process(tiny)
     for pair, flags in planned_flags.items():
         folder = tiny / "results" / "f01"
         image = image_of(campaign, pair)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import rasterio
 import xarray as xr
-from folders import run_steps
 from pyproj import Transformer
 from rio_cogeo.cogeo import cog_validate
 
@@ -18,6 +17,7 @@ from apertura.common.provenance import Provenance, packages, sha256_file, softwa
 from apertura.core.backprojection.engines import instruction_set
 from apertura.formats.catalog import DOCUMENTS
 from apertura.formats.export import exports_in, product_files
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages.image_tags import quality_tags
 
@@ -93,9 +93,7 @@ def test_raster_tags_state_sources_and_software(finished_tiny, name):
 def test_raster_tags_name_only_recordings_of_their_flight(tmp_path):
     plan = replace(preset("demo", pulses=20), scene=ImageGrid("EPSG:32632", half_width_m=1.5, spacing_m=0.1))
     (flight,) = plan.flights
-    campaign = run_steps(
-        simulate(tmp_path / "two", replace(plan, flights=(flight, replace(flight, name="f02"))), seed=3)
-    )
+    campaign = process(simulate(tmp_path / "two", replace(plan, flights=(flight, replace(flight, name="f02"))), seed=3))
     for name in product_files(campaign.images):
         if name.endswith(".tif"):
             inputs = json.loads(tags_of(campaign, name)["APERTURA_INPUTS"])

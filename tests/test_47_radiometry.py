@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.transform
-from folders import complaint, copy_writable, edit_config, export_flight, run_steps, state
+from folders import complaint, copy_writable, edit_config, state
 from scenes import straight_track
 
 from apertura.campaign.folder import Campaign
@@ -20,6 +20,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import Looks
 from apertura.core.scene.terrain import Plane
 from apertura.formats.export import product_files
+from apertura.run.process import process
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.stages.export import export_fused
@@ -62,8 +63,8 @@ def plan(radio=RADIO, **grid):
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """Image and export the flight."""
-    campaign = run_steps(simulate(tmp_path_factory.mktemp("radio") / "campaign", plan(), seed=3), exports=False)
-    export_flight(campaign, "f01")
+    campaign = process(simulate(tmp_path_factory.mktemp("radio") / "campaign", plan(), seed=3), last="cube")
+    process(campaign, first="layers", last="export_fused")
     return campaign
 
 
@@ -108,7 +109,7 @@ def test_noise_figure_of_symbols_of_varying_modulus_is_that_of_the_receiver(tmp_
     changing = replace(base, waveform=replace(base.waveform, code="64qam", frames=120))
     root = simulate(tmp_path / "campaign", changing, seed=3)
     edit_config(root, lambda document: document.update(processing={"symbol_filter": symbol_filter}))
-    campaign = run_steps(root, exports=False)
+    campaign = process(root, last="cube")
     for pair in PAIRS:
         layers(campaign, "f01", pair)
         noise = report_of(campaign, pair)["noise"]
@@ -126,7 +127,7 @@ def test_noise_figure_of_a_scene_of_noise_does_not_contain_the_gain_of_the_filte
     changing = replace(base, targets=weak, waveform=replace(base.waveform, code="64qam", frames=120))
     root = simulate(tmp_path / "campaign", changing, seed=3)
     edit_config(root, lambda document: document.update(processing={"symbol_filter": symbol_filter}))
-    campaign = run_steps(root, exports=False)
+    campaign = process(root, last="cube")
     layers(campaign, "f01", "uav1-uav1")
     noise = report_of(campaign, "uav1-uav1")["noise"]
     assert abs(noise["noise_figure_measured_db"] - 6) < 1
@@ -403,7 +404,7 @@ def test_sigma0_is_nan_in_layover_and_shadow(flown, tmp_path):
         raster.write(ridge, 1)
     state(root, "processing", radiometry=["sigma0", "beta0"], multilook={"spacing_m": 0.2})
     state(root, "scene", dem="dem.tif", dem_datum="ellipsoid")
-    campaign = run_steps(root, exports=False)
+    campaign = process(root, last="cube")
     layers(campaign, "f01", "uav1-uav1")
     folder = campaign.result("f01", "uav1-uav1")
     names = ("mask", "sigma0_db", "beta0_db", "multilook_sigma0_power")

@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
-from folders import complaint, copy_writable, edit_config, export_flight, run_steps, state
+from folders import complaint, copy_writable, edit_config, state
 
 from apertura.campaign.folder import Campaign
 from apertura.check import as_line, problems
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.imaging.reflectors import Reflector
+from apertura.run.process import process
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.stages import cphd, export, layers
 from apertura.stages.pair import open_pair
@@ -126,10 +127,7 @@ def measured(tmp_path_factory):
         {"name": "ball", "kind": "sphere", "size_m": [RADIUS_M], "position_m": positions_m[1], "std_m": 0.02},
     ]
     state(root, "scene", reflectors=reflectors)
-    campaign = run_steps(root, exports=False)
-    for flight in ("f01", "f02"):
-        export_flight(campaign, flight)
-    return campaign
+    return process(root, last="export_fused")
 
 
 @pytest.fixture(scope="module")
@@ -142,8 +140,8 @@ def later(measured, tmp_path_factory):
     root = remove_radio(simulate(tmp_path_factory.mktemp("later") / "campaign", spec, seed=5))
     shutil.copy(str(write_constants(measured)), root / "calibration.json")
     state(root, "processing", radiometric_calibration="calibration.json")
-    campaign = run_steps(root, exports=False)
-    export_flight(campaign, "f01")
+    campaign = process(root, last="cube")
+    process(campaign, first="layers", last="export_fused")
     return campaign
 
 
@@ -247,7 +245,7 @@ def test_gain_loss_between_flights_is_flagged_in_its_pair(measured, tmp_path):
     meta = json.loads(path.with_suffix(".sigmf-meta").read_text())
     meta["global"]["core:sha512"] = hashlib.sha512(path.read_bytes()).hexdigest()
     path.with_suffix(".sigmf-meta").write_text(json.dumps(meta))
-    campaign = run_steps(root, exports=False)
+    campaign = process(root, last="cube")
     for flight in campaign.image_flights:
         for pair in flight.pairs:
             layers.layers(campaign, flight.name, pair)
@@ -306,7 +304,7 @@ def test_reflectors_outside_the_image_are_excluded_with_a_dem(measured, tmp_path
     table = root / "config/flights.tsv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
     state(root, "scene", **stated)
-    campaign = run_steps(root, exports=False)
+    campaign = process(root, last="cube")
     layers.layers(campaign, "f01", "uav1-uav1")
     layers.layers(campaign, "f01", "uav1-uav2")
     constants, excluded = measured_constants(campaign)
@@ -328,7 +326,7 @@ def test_phase_history_is_calibrated_from_its_images(measured, tmp_path):
     written = cphd.cphd(measured, "f01", "uav1-uav1")
     (tmp_path / "raw/f01").mkdir(parents=True)
     shutil.copy(str(written), tmp_path / "raw/f01/uav1.cphd")
-    campaign = run_steps(tmp_path, exports=False)
+    campaign = process(tmp_path, last="cube")
     layers.layers(campaign, "f01", "uav1-uav1")
     constant = read_constants(write_constants(campaign)).pairs["uav1-uav1"]
     assert constant.radar.sent_power is None

@@ -12,7 +12,7 @@ import rasterio
 import rioxarray  # noqa: F401
 import xarray as xr
 import zarr
-from folders import ROOT, complaint, contents, copy_writable, edit_config, run_steps
+from folders import ROOT, complaint, contents, copy_writable, edit_config
 from pyproj import CRS, Transformer
 from walked import walk
 
@@ -22,6 +22,7 @@ from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import RASTERS
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence
+from apertura.run.process import process
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import cube
 from apertura.workflow.stale import stale_results
@@ -41,7 +42,7 @@ def run_two_flights(root):
     second = replace(first, name="f02", tracks=lifted, start_utc="2025-05-15T09:30:00")
     simulate(root, replace(plan, scene=grid, flights=(first, second)), seed=7)
     edit_config(root, lambda document: document.setdefault("processing", {}).update(tile_px=16))
-    run_steps(root, exports=False)
+    process(root, last="cube")
 
 
 @pytest.fixture(scope="session")

@@ -4,13 +4,14 @@ import json
 
 import pystac
 import pytest
-from folders import complaint, copy_writable, run_steps
+from folders import complaint, copy_writable
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.common.contracts import SUMMED
 from apertura.formats.catalog import CATALOG
 from apertura.formats.export import product_files
+from apertura.run.process import process
 from apertura.stages.export import export_fused
 from apertura.views.report.pictures import pictures, pictures_fused
 from apertura.views.report.step import landing, page
@@ -30,7 +31,7 @@ def keep_one_node(root):
 @pytest.fixture(scope="session")
 def alone(_tiny, made_once):
     """Return the tiny campaign with the transmitter only and all its results; read only."""
-    return Campaign.load(made_once("alone", lambda root: run_steps(keep_one_node(copy_writable(_tiny, root)))))
+    return Campaign.load(made_once("alone", lambda root: process(keep_one_node(copy_writable(_tiny, root)))))
 
 
 def test_single_pair_has_no_results_of_sums(tiny):

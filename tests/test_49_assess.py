@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from folders import SHARED, copy_writable, edit_config, edit_track, run_steps
+from folders import SHARED, copy_writable, edit_config, edit_track
 from rich.console import Console
 
 from apertura.campaign.folder import Campaign
@@ -15,6 +15,7 @@ from apertura.campaign.store import record_files
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
+from apertura.run.process import process
 from apertura.simulation import preset, simulate
 from apertura.stages import assess, cube, echo, export, hypotheses, image, profile
 from apertura.stages.acquisition import check_rates
@@ -40,7 +41,7 @@ def run_sample(folder, change=lambda _: None):
         pytest.skip("../shared/data is absent")
     root = copy_writable(SHARED / "campaign-sample", folder / "campaign")
     change(root)
-    return run_steps(root)
+    return process(root)
 
 
 def test_correct_campaign_is_focused_and_raises_no_flag(finished_sample):
@@ -271,7 +272,7 @@ def test_sum_states_its_gain(finished_tiny):
 def papers_flight(tmp_path_factory):
     root = tmp_path_factory.mktemp("uav") / "campaign"
     simulate(root, preset("paper-uav"), seed=1)
-    return run_steps(root)
+    return process(root)
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
-from folders import complaint, contents, copy_writable, edit_config, run_steps
+from folders import complaint, contents, copy_writable, edit_config
 from test_40_graph import check
 
 from apertura.campaign.folder import Campaign
 from apertura.formats.export.change import COLUMNS, NO_DATA
+from apertura.run.process import process
 from apertura.simulation import Clutter, ImageGrid, PointTarget, TargetChange, simulate
 from apertura.simulation.presets import revisit
 from apertura.stages.change import change
@@ -46,7 +47,7 @@ def small(made_once):
     def made(root):
         simulate(root, revisited())
         edit_config(root, configure)
-        run_steps(root)
+        process(root)
 
     return made_once("change", made)
 

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
-from folders import complaint, contents, copy_writable, edit_config, run_steps
+from folders import complaint, contents, copy_writable, edit_config
 
 from apertura.campaign.config import Interferometry
 from apertura.campaign.folder import Campaign
 from apertura.core.quality.budget import NodePositions
 from apertura.formats.catalog.validation import stac_problems
 from apertura.formats.export import exports_in
+from apertura.run.process import process
 from apertura.simulation import (
     CampaignSpecification,
     Clutter,
@@ -75,7 +76,7 @@ def run_ramp(folder, **choices):
         config["interferometry"] = {"pairs": {NAME: ["f01/uav1-uav1", "f02/uav1-uav1"]}}
 
     edit_config(root, configure)
-    run_steps(root)
+    process(root)
     return root
 
 

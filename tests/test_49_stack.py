@@ -6,13 +6,14 @@ import json
 import numpy as np
 import pytest
 import rasterio
-from folders import complaint, contents, copy_writable, edit_config, run_steps
+from folders import complaint, contents, copy_writable, edit_config
 from test_40_graph import check
 
 from apertura.campaign.config import Stack
 from apertura.campaign.folder import Campaign
 from apertura.formats.export import exports_in
 from apertura.methods.interferometry.coherence import box_sum
+from apertura.run.process import process
 from apertura.simulation import Clutter, ImageGrid, PointTarget, TargetChange, simulate
 from apertura.simulation.presets import revisit
 from apertura.stages.stack import stack, stack_image
@@ -60,7 +61,7 @@ def small(made_once):
     def made(root):
         simulate(root, small_revisit(pulses=60, error_m=0.004))
         edit_config(root, stacked)
-        run_steps(root)
+        process(root)
 
     return made_once("stack", made)
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from folders import copy_writable, run_steps
+from folders import copy_writable
 
 from apertura import cli
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.common.documents import read_json
 from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.run.process import process
 from apertura.simulation.targets import PointTarget
 from apertura.stages.scene import open_scene
 from apertura.tools.design import designed
@@ -166,7 +167,7 @@ def test_predicted_image_quality_is_measured_in_the_simulated_flight(tmp_path, m
     """Widths agree within 5 %, NESZ and RCS within 1 dB; the noise of 256 pulses is measured to 0.4 dB."""
     document = copy.deepcopy(PLAN) | {"flights": {"f01": PLAN["flights"]["f01"] | {"tracks": {"uav1": LINE}}}}
     design = designed(FlightPlan.model_validate(document), tmp_path)
-    campaign = run_steps(rehearse(design.opened, [PointTarget((0.0, 0.0, 0.0))], tmp_path / "flown"), exports=False)
+    campaign = process(rehearse(design.opened, [PointTarget((0.0, 0.0, 0.0))], tmp_path / "flown"), last="cube")
     planned, grid = design.images["f01/uav1-uav1"].layers, open_scene(campaign).grid
     pixels = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").image.values
     peak = find_peak(pixels, 40, 40)

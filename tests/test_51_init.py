@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from folders import complaint, contents, run_steps
+from folders import complaint, contents
 from loose_files import epochs, int16_and_logs, truth, write_csv, write_nmea, write_samples, write_ulog
 from rasterio.transform import from_origin
 
@@ -22,6 +22,7 @@ from apertura.core.quality.bright_points import brightest_near
 from apertura.core.quality.point_targets import find_peak
 from apertura.formats.reading import open_recording
 from apertura.formats.time_tags import read_time_tags
+from apertura.run.process import process
 from apertura.simulation import preset, simulate
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 from apertura.tools.init import campaign_from_files
@@ -116,7 +117,7 @@ def test_targets_of_int16_samples_are_within_2_cm(tmp_path, conjugate):
         "scene.spacing_m": "0.05",
     }
     made = campaign_from_files(tmp_path / "made", [folder], settings=grid, ask=answering(ANSWERS))
-    campaign = run_steps(made.folder, exports=False)
+    campaign = process(made.folder, last="cube")
     for pair in ("alpha-alpha", "alpha-bravo"):
         stage = open_stage(campaign.stage("image", "f01", pair), "image")
         x, y = stage.x.values, stage.y.values

@@ -16,7 +16,7 @@ import google_crc32c
 import pytest
 import yaml
 from attack.planted import SNAKEMAKES_OWN, Code, hostile_texts, plant
-from folders import copy_writable, edit_config, run_steps, write_plane
+from folders import copy_writable, edit_config, write_plane
 from typer.main import get_command
 
 from apertura.campaign.config.template import config_schema
@@ -25,6 +25,7 @@ from apertura.cli import app
 from apertura.common.errors import CampaignError
 from apertura.common.processes import SAFE_PATH
 from apertura.run.driver import code_from_outside
+from apertura.run.process import process
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
@@ -175,7 +176,7 @@ def _on_a_plane(_tiny, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def _finished(_on_a_plane, tmp_path_factory):
-    root = run_steps(copy_writable(_on_a_plane, tmp_path_factory.mktemp("finished_plane") / "campaign")).root
+    root = process(copy_writable(_on_a_plane, tmp_path_factory.mktemp("finished_plane") / "campaign")).root
     (root / "plan.yaml").write_text(yaml.safe_dump(plan_of(root)))
     return root
 

@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import ROOT, copy_writable, run_steps
+from folders import ROOT, copy_writable
 from matplotlib.image import imread, imsave
 from pyproj import Transformer
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import record_files
+from apertura.run.process import process
 from apertura.simulation import preset, simulate
 from apertura.tools.preview import pair as preview_pair
 from apertura.tools.preview.follow import Preview
@@ -103,7 +104,7 @@ def shown(browser, address, *, size=(1000, 700), drawn=True, also=()):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """Run the demo of 300 pulses, which resolves all targets."""
-    return run_steps(simulate(tmp_path_factory.mktemp("map") / "campaign", preset("demo"), seed=1))
+    return process(simulate(tmp_path_factory.mktemp("map") / "campaign", preset("demo"), seed=1))
 
 
 @pytest.fixture(scope="module")
@@ -693,7 +694,7 @@ def test_local_frame_is_labelled_with_x_and_y(browser, shared, tmp_path):
     (root / "raw/pass1").mkdir(parents=True)
     for path in (shared / "gotcha_afrl").glob("*.mat"):
         shutil.copyfile(path, root / f"raw/pass1/aircraft.{path.name}")
-    run_steps(root)
+    process(root)
     with serving(root) as address, shown(browser, address) as (frame, errors_and_requests):
         frame.locator("#targets button").first.click()
         until(frame, lambda: "cm along x" in frame.inner_text("#targets"))

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from folders import ROOT, copy_writable, ingest_all, settle_ground, state
+from folders import ROOT, copy_writable, state
 
 import apertura as ap
 from apertura.campaign.folder import Campaign
@@ -25,6 +25,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import window_weights
 from apertura.core.geometry.gate import EDGE_CELLS, RangeGate
 from apertura.formats.recordings.sigmf import GrowingSigmf, open_sigmf
+from apertura.run.process import process
 from apertura.run.results import clean
 from apertura.simulation import ImageGrid, preset
 from apertura.stages import echo
@@ -398,10 +399,10 @@ def test_focus_is_judged_once_the_aperture_suffices(tmp_path, monkeypatch):
 def test_automatic_scene_equals_that_of_a_run(tiny, tmp_path):
     state(tiny, "scene", bounds_m="auto", spacing_m=0.5)
     other = Campaign.load(copy_writable(tiny, tmp_path / "other"))
-    ingest_all(other)
+    process(other, last="ingest")
     for pair in other.flight("f01").pairs:
         echo.echo(other, "f01", pair)
-    settle_ground(other)
+    process(other, first="scene", last="terrain")
     preview = Preview(Campaign.load(tiny), follow=False)
     preview.run()
     grids = {pair.images[1].grid for pair in preview.pairs}

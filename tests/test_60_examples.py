@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import complaint, run_steps
+from folders import complaint
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.check import problems
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.optitrack import read_optitrack
+from apertura.run.process import process
 from apertura.tools.align import align, write_clock
 from apertura.views.score import score
 
@@ -85,7 +86,7 @@ def test_alignment_with_fixed_path_offset_estimates_the_clock(rail_pass):
 @pytest.mark.slow
 def test_reflector_of_the_rail_pass_is_imaged_at_its_position(rail_pass):
     assert problems(rail_pass) == []
-    run_steps(rail_pass, exports=False)
+    process(rail_pass, last="cube")
     off_m, above_db, (across_m, along_m) = response(rail_pass, reflector(rail_pass))
     assert off_m < 0.02
     assert above_db > 20
@@ -106,7 +107,7 @@ def test_rail_pass_is_aligned_by_image_sharpness_within_10_cm(rail_pass):
     write_clock(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=alignment.offset_width_s)
     config = rail_pass / "config/config.yaml"
     config.write_text(config.read_text().replace("radar: 3.8194", f"radar: {stated['path_offset_m']:.4f}"))
-    run_steps(rail_pass, exports=False)
+    process(rail_pass, last="cube")
     assert response(rail_pass, reflector(rail_pass))[0] < 0.10
 
 
@@ -116,7 +117,7 @@ def test_targets_of_a_real_px4_trajectory_are_within_a_centimetre(shared, tmp_pa
         shared / "px4_real_flight" / "esc_status_log.ulg", tmp_path / "replayed"
     )
     assert problems(tmp_path / "replayed") == []
-    run_steps(tmp_path / "replayed")
+    process(tmp_path / "replayed")
     findings = [row for row in score(Campaign.load(tmp_path / "replayed")) if row.image == "uav1-uav1"]
     assert len(findings) == 3
     assert max(row.error_m for row in findings) < 0.01

@@ -23,6 +23,7 @@ _GROUP_OF = {
     "PhaseHistory": "Images",
     "Profiles": "Images",
     "simulate": "Campaigns",
+    "process": "Campaigns",
     "open_campaign": "Campaigns",
     "campaign_from_files": "Campaigns",
     "write_campaign": "Campaigns",

@@ -19,7 +19,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.common.errors import CampaignError
 from apertura.core.scene.grid import SceneGrid
-from apertura.stages import assess, cube, echo, export, image, ingest, layers, profile, refine, scene
+from apertura.run.process import process
 from apertura.stages.scene import settled_scene
 
 
@@ -66,7 +66,7 @@ def run_campaign(root: Path) -> Outcome:
             warnings.simplefilter("ignore")
             campaign = Campaign.load(root)
             flight = campaign.image_flights[0]
-            _steps(campaign, flight)
+            process(campaign, last="export_fused")
     except CampaignError as error:
         return Outcome(str(error).splitlines()[0].replace(f"{root}/", ""), time.perf_counter() - start_s)
     except Exception as error:  # a crash is also a result; the other campaigns are still processed
@@ -74,33 +74,6 @@ def run_campaign(root: Path) -> Outcome:
         return Outcome(text.splitlines()[0], time.perf_counter() - start_s)
     seconds = time.perf_counter() - start_s
     return Outcome("", seconds, _reports(campaign, flight), dict(_images(campaign, flight)), _grid(campaign))
-
-
-def image_steps(campaign: Campaign, flight: Flight) -> None:
-    """Run the steps of a flight in the order of the workflow, from its recordings to the assessed images."""
-    for node in flight.participants:
-        ingest.ingest(campaign, flight.name, node)
-    for pair in flight.pairs:
-        echo.echo(campaign, flight.name, pair)
-    scene.scene(campaign)
-    if campaign.settings.scene.dem:
-        scene.terrain(campaign)
-    for pair in flight.pairs:
-        profile.profile(campaign, flight.name, pair)
-    refine.refine(campaign, flight.name)
-    for pair in flight.pairs:
-        image.image(campaign, flight.name, pair, threads=1)
-    assess.assess(campaign, flight.name)
-
-
-def _steps(campaign: Campaign, flight: Flight) -> None:
-    image_steps(campaign, flight)
-    cube.cube(campaign)
-    for pair in flight.pairs:
-        layers.layers(campaign, flight.name, pair)
-        export.export(campaign, flight.name, pair)
-    if FUSED in flight.images:
-        export.export_fused(campaign, flight.name)
 
 
 def _grid(campaign: Campaign) -> SceneGrid:

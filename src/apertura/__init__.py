@@ -36,6 +36,7 @@ _PUBLIC = {
     "judge": "apertura.core.imaging.judgement",
     "open_campaign": "apertura.tools.open_campaign",
     "open_dem": "apertura.core.scene.dem",
+    "process": "apertura.run.process",
     "range_compress": "apertura.core.imaging.range_profiles",
     "read_geotiff": "apertura.formats.export.geotiff",
     "simulate": "apertura.simulation",
@@ -48,7 +49,7 @@ _PUBLIC = {
 _ON_LINUX = frozenset(
     (
         *("Dem", "RecordedFlight", "RecordedNode", "campaign_from_files", "design", "open_campaign", "open_dem"),
-        *("read_geotiff", "simulate", "write_campaign", "write_geotiff"),
+        *("process", "read_geotiff", "simulate", "write_campaign", "write_geotiff"),
     )
 )
 """Public names that access campaign folders or rasters; the others work on every operating system."""

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from apertura.campaign.config import Flight, SampledWaveform, is_monostatic
+from apertura.campaign.config import SampledWaveform, is_monostatic
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import record_files
 from apertura.common.atomic import remove
@@ -24,7 +24,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
 from apertura.common.units import decibels
 from apertura.core.quality.budget import is_counted
-from apertura.stages import assess, calibration, cube, echo, export, image, ingest, layers, profile, refine, scene
+from apertura.run.process import process
 from apertura.tools.chart.pareto import save_png
 from apertura.workflow.lineage import result_of, with_inputs
 from apertura.workflow.rules import STUDY
@@ -214,39 +214,16 @@ def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign
 
 
 def _processed(campaign: Campaign) -> _Run:
-    """Run all processing steps of a campaign in the order of the workflow's rules."""
+    """Process the first image flight of a campaign, with the calibration flights, up to the GeoTIFFs."""
     campaign.results.remove()
-    flight, start_s = campaign.image_flights[0], (process_time(), perf_counter())
+    flight = campaign.image_flights[0]
+    flights = tuple(one for one in campaign.flights if one.kind == "calibration" or one == flight)
+    start_s = process_time(), perf_counter()
     with contextlib.redirect_stdout(io.StringIO()):
-        for other in campaign.flights:
-            if other.kind == "calibration":
-                _echoes(campaign, other)
-                calibration.calibrate(campaign, other.name)
-        _echoes(campaign, flight)
-        scene.scene(campaign)
-        if campaign.settings.scene.dem:
-            scene.terrain(campaign)
-        for pair in flight.pairs:
-            profile.profile(campaign, flight.name, pair)
-        refine.refine(campaign, flight.name)
-        for pair in flight.pairs:
-            image.image(campaign, flight.name, pair)
-        assess.assess(campaign, flight.name)
-        cube.cube(replace(campaign, flights=(flight,)))
-        for pair in flight.pairs:
-            layers.layers(campaign, flight.name, pair)
-            export.export(campaign, flight.name, pair)
+        process(replace(campaign, flights=flights), last="export")
     elapsed_s = process_time() - start_s[0], perf_counter() - start_s[1]
     files = [campaign.results / flight.name / pair / "image.json" for pair in flight.pairs]
     return _Run(*elapsed_s, os.getloadavg()[0], [json.loads(file.read_text(encoding="utf-8")) for file in files])
-
-
-def _echoes(campaign: Campaign, flight: Flight) -> None:
-    if isinstance(campaign.settings.waveform, SampledWaveform):
-        for node in flight.nodes:
-            ingest.ingest(campaign, flight.name, node)
-    for pair in flight.pairs:
-        echo.echo(campaign, flight.name, pair)
 
 
 def _whole(name: str, runs: list[_Run]) -> Whole:
