@@ -23,6 +23,7 @@ from apertura.run.process import process
 from apertura.simulation import Impairments, PulseSpecification, WaveformSpecification, preset, simulate
 from apertura.simulation.targets import PointTarget
 from apertura.stages.scene import open_scene
+from apertura.stages.transfer import PairEcho
 
 PULSE = {"carrier_hz": 1.4048e9, "pulse_s": 1e-6, "listen_s": 0.78125e-6, "sample_rate_hz": 1.024e9, "prf_hz": 20.0}
 BAND = {"lead_s": 0.1e-6, "band_hz": (-204.8e6, 204.8e6)}
@@ -83,7 +84,7 @@ def aligned(stage: xr.Dataset, campaign: Campaign) -> np.ndarray:
 
 def sidelobes_db(campaign: Campaign, pair: str) -> float:
     """Return the highest sidelobe of one target's range profile with a Hann window, at all delays."""
-    stage = open_stage(campaign.stage("echo", "f01", pair), "echo")
+    stage = PairEcho.opened(campaign, "f01", pair).stage
     mean = aligned(stage, campaign).mean(0)
     count = len(mean)
     level = np.abs(np.fft.ifft(mean * window_weights("hann", count), 16 * count))
@@ -93,7 +94,7 @@ def sidelobes_db(campaign: Campaign, pair: str) -> float:
 
 def noise_loss_db(campaign: Campaign, pair: str, snr_db: float) -> float:
     """Return the loss of the SNR in the range profile of one target relative to N·SNR, without window."""
-    stage = open_stage(campaign.stage("echo", "f01", pair), "echo")
+    stage = PairEcho.opened(campaign, "f01", pair).stage
     own = aligned(stage, campaign)
     profile_ = np.fft.ifft(own, axis=1)
     noise = (np.abs(profile_ - profile_.mean(0)) ** 2).mean() * len(own) / (len(own) - 1)

@@ -31,6 +31,15 @@ def findings(campaign, image):
     return [finding for finding in score(campaign) if finding.image == image]
 
 
+def test_only_the_selected_steps_are_run(tiny):
+    process(tiny, last="ingest")
+    assert {path.name for path in (tiny / "results/f01").rglob("*.zarr")} == {"raw.zarr", "track.zarr"}
+    process(tiny, first="echo", last="scene")
+    assert not (tiny / "results/f01/uav1-uav1/profile.zarr").exists()
+    with pytest.raises(ValueError, match="'imaeg' is not a step of the workflow: ingest, bench, echo"):
+        process(tiny, last="imaeg")
+
+
 @pytest.mark.parametrize("image", ["uav1-uav1", "uav1-uav2", "fused"])
 def test_targets_of_the_sample_focus_within_3_cm(finished_sample, image):
     targets = findings(finished_sample, image)
