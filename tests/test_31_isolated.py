@@ -119,6 +119,17 @@ def test_reader_that_exceeds_the_memory_limit_is_stopped(tmp_path):
         read_isolated(Lazy("numpy").fromfile, [tmp_path / "a.mat"], memory_bytes=1 << 30)
 
 
+@pytest.mark.slow
+def test_arrays_of_many_files_may_exceed_the_memory_limit_of_one(tmp_path, monkeypatch):
+    (tmp_path / "large.py").write_text("import numpy\n\ndef read(path):\n    return {'a': numpy.ones(20_000_000)}\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    paths = [tmp_path / name for name in "abcd"]
+    for path in paths:
+        path.touch()
+    files = read_isolated(Lazy("large").read, paths, memory_bytes=1 << 29)
+    assert [fields["a"][-1] for fields in files] == [1.0] * 4
+
+
 @pytest.mark.usefixtures("reader")
 def test_arrays_of_all_files_are_one_mapping(tmp_path):
     """A flight may have more files than a process may hold open."""

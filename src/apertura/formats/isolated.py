@@ -153,7 +153,7 @@ def _main(function: str, memory_bytes: str, seconds: str, folder: str, *paths: s
     """Set the limits of this process, read the files, and write their arrays."""
     limits = {
         resource.RLIMIT_AS: int(memory_bytes),
-        resource.RLIMIT_FSIZE: int(memory_bytes),
+        resource.RLIMIT_FSIZE: int(memory_bytes) * len(paths),
         resource.RLIMIT_CPU: int(seconds),
         resource.RLIMIT_CORE: 0,
     }
