@@ -1,11 +1,13 @@
 """Interferogram of two flights over a ramp: height map, files, tags, flags and invalid configs."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import rasterio
+import xarray as xr
 from folders import complaint, contents, copy_writable, edit_config
 
 from apertura.campaign.config import Interferometry
@@ -29,6 +31,7 @@ from apertura.simulation import (
 )
 from apertura.stages import interferogram as step
 from apertura.stages.interferogram import interferogram
+from apertura.stages.tags import copied_inputs
 from apertura.views.summary import print_summary
 from apertura.views.verify.chain import print_verified
 from apertura.views.webmap.server import served
@@ -275,6 +278,33 @@ def test_height_errors_of_a_ramp_agree_with_their_deviation(tmp_path):
     assert np.ptp(ramp_at(root, transform, height.shape)) > 1.0
     report = json.loads((root / "results/interferometry" / NAME / "interferogram.json").read_text())
     assert report["flags"] == {}
+
+
+def test_files_of_two_flights_are_copies_if_their_contents_are_equal():
+    first, second = (
+        xr.Dataset(attrs={"inputs": {"raw/codes.npy": "c", f"raw/{flight}/a.npy": "1", f"raw/{flight}/b.csv": flight}})
+        for flight in ("f01", "f02")
+    )
+    assert copied_inputs(first, second) == {
+        "inputs_copied": "files with the same content: raw/f01/a.npy = raw/f02/a.npy"
+    }
+    assert copied_inputs(first, first) == {}
+    own = xr.Dataset(attrs={"inputs": {"raw/f01/uav2.npy": "1"}})  # two nodes may have equal time tags
+    assert copied_inputs(first, own) == {}
+
+
+@pytest.mark.slow
+def test_copy_of_a_flight_is_flagged(tiny):
+    shutil.copytree(tiny / "raw/f01", tiny / "raw/f02")
+    table = tiny / "config/flights.tsv"
+    head, row = table.read_text().splitlines()[:2]
+    table.write_text("\n".join([head, row, row.replace("f01", "f02", 1)]) + "\n")
+    pair = ["f01/uav1-uav1", "f02/uav1-uav1"]
+    edit_config(tiny, lambda document: document.update(interferometry={"pairs": {"copy": pair}}))
+    process(tiny, last="layers")
+    process(tiny, first="interferogram", last="interferogram")
+    report = json.loads((tiny / "results/interferometry/copy/interferogram.json").read_text())
+    assert "raw/f01/uav1.sigmf-data = raw/f02/uav1.sigmf-data" in report["flags"]["inputs_copied"]
 
 
 @pytest.mark.slow

@@ -635,6 +635,12 @@ _OF_IMAGES = {
         "baseline of the tracks; changes between the flights; focus of both images",
         "methods/interferometry/comparison.py",
     ),
+    "inputs_copied": Flag(
+        "files with the same content",
+        "recordings or logs of two flights are copies of the same file: the images are not independent",
+        "the recordings and logs in raw/ of both flights",
+        "stages/tags.py",
+    ),
     "stack_flight_excluded": Flag(
         "reason: coherence, residual phase in rad, or fraction of the windows that follow one residual track",
         "the flight does not fit into the stack and is left out of its list of flights",

@@ -16,6 +16,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, record_files
 from apertura.common.atomic import write_json
 from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json
 from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.looks import Lattice, Looks
@@ -42,7 +43,7 @@ from apertura.stages.pair import OpenPair, open_pair
 from apertura.stages.planning import gated, weighing
 from apertura.stages.refine import clock_s, open_refined
 from apertura.stages.scene import OpenScene, open_scene
-from apertura.stages.tags import tags_of
+from apertura.stages.tags import copied_inputs, tags_of
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 from apertura.workflow.rules import INTERFEROMETRY
@@ -341,7 +342,7 @@ def _report(formed: Interferogram, two: TwoImages) -> dict[str, Any]:
         "level": None if formed.level is None else {**asdict(formed.level), "says": _level_line(formed.level)},
         "height_std_m": std_m,
         "says": _summary(formed, std_m, [platform for platform, std in two.track_std_m.items() if std is None]),
-        "flags": interferogram_flags(formed.measured),
+        "flags": Flags.merged(copied_inputs(*two.images), interferogram_flags(formed.measured)),
     }
 
 

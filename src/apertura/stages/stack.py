@@ -18,6 +18,7 @@ from apertura.common.arrays import Floats
 from apertura.common.atomic import write_json, write_text
 from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json
 from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.looks import Looks
@@ -43,7 +44,7 @@ from apertura.stages.pair import OpenPair, open_pair
 from apertura.stages.planning import gated, integration_of, weighing
 from apertura.stages.refine import errors_of, open_refined
 from apertura.stages.scene import OpenScene, open_scene
-from apertura.stages.tags import tags_of
+from apertura.stages.tags import copied_inputs, tags_of
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 from apertura.workflow.rules import STACK
@@ -356,7 +357,7 @@ def stack_image(campaign: Campaign, flight: str) -> list[Path]:
         "expected_coherence": _rounded(fit.expected),
         "looks": _rounded(referred.looks),
         "chance": round(chance(referred.looks), 4) if referred.looks > 1 else 1.0,
-        "flags": fit.flags,
+        "flags": Flags.merged(copied_inputs(image.stage, reference.stage), fit.flags),
     }
     report["says"] = f"left out: {fit.reason}" if fit.reason else _summary(report)
     origin = Provenance.of(

@@ -45,6 +45,17 @@ def stamped(
     return stamp(dataset, stage, **vars(origin))
 
 
+def copied_inputs(first: xr.Dataset, second: xr.Dataset) -> dict[str, str]:
+    """Return a flag if recordings or logs of two flights have the same content, as a copy has under another name."""
+    of_second = {digest: name for name, digest in second.attrs["inputs"].items()}
+    equal = [
+        f"{name} = {of_second[digest]}"
+        for name, digest in first.attrs["inputs"].items()
+        if digest in of_second and name.split("/")[:2] != of_second[digest].split("/")[:2]
+    ]
+    return {"inputs_copied": f"files with the same content: {', '.join(equal)}"} if equal else {}
+
+
 def tags_of(origin: Provenance, lineage: Lineage) -> dict[str, str]:
     """Return the provenance tags of an exported file: settings, inputs and code, and the hashes of its source files.
 
