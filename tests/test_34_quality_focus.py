@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import apertura as ap
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flag_table import FLAGS
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.focus_check import focus_flags
@@ -257,6 +259,30 @@ def test_loss_beyond_expectation_is_flagged_also_below_1_db(loss_db, std_db, exp
     bad = focus_flags(report | {"verdict": "defocused"}, expected)
     assert "defocused" in bad
     assert "loss_unexpected" not in bad
+
+
+@pytest.mark.parametrize("changed", ["nothing", "sign", "one target moves"])
+def test_points_with_unequal_focus_are_flagged(changed):
+    """Five points over 24 m, phases referred to their centre: the opposite sign mirrors their positions (eq. 1″)."""
+    frequency, pulses = 2.4e9 + 400e6 * (np.arange(128) / 128 - 0.5), 240
+    antenna = np.stack([np.linspace(-6, 6, pulses), np.full(pulses, -40.0), np.full(pulses, 22.0)], -1)
+    places = np.array([[0.0, 0, 0], [11.9, 12, 0], [9.1, -6, 0], [-8.4, -12, 0], [-11.2, 5.7, 0]])
+    reference_s = 2 * np.linalg.norm(antenna, axis=1) / SPEED_OF_LIGHT_M_S
+    noise = np.random.default_rng(1).normal(size=(pulses, 128, 2)) @ (0.1, 0.1j)
+    transfer = noise.astype(np.complex64)
+    for number, place in enumerate(places):
+        moved_m = np.linspace(-1, 1, pulses) ** 2 * 0.04 if number == 3 and changed == "one target moves" else 0.0
+        delay_s = 2 * (np.linalg.norm(antenna - place, axis=1) + moved_m) / SPEED_OF_LIGHT_M_S - reference_s
+        transfer += np.exp(-2j * np.pi * np.outer(delay_s, frequency))
+    transfer = transfer.conj() if changed == "sign" else transfer
+    flown, weight = ap.Aperture(antenna, antenna), np.full(128, 1 / 128)
+    history = ap.PhaseHistory(transfer, frequency, weight, reference_s, flown)
+    image = ap.backproject(history, ap.SceneGrid("local", -18.0, 18.0, 0.12, (300, 300)))
+    flags = ap.judge(image).flags
+    assert ("focus_uneven" in flags) == (changed != "nothing")
+    if changed == "one target moves":
+        assert "1 of 5 bright points" in flags["focus_uneven"]
+        assert "at (-8." in flags["focus_uneven"]
 
 
 def test_unconfigured_terms_are_not_summed_and_do_not_set_the_accuracy():

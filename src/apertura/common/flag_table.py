@@ -529,6 +529,13 @@ _OF_IMAGES = {
         "nodes.<n>.position_std_m, scene.height_std_m and time_tag_std_s, which may be too optimistic",
         "core/imaging/focus_check.py",
     ),
+    "focus_uneven": Flag(
+        "number of points, and their loss, dB; median loss; position and loss of the worst point",
+        "single bright points are defocused although most are focused: they moved, or the geometry is wrong by amounts "
+        "that depend on the position, such as heights, reference point, carrier, or the sign of the phase",
+        "heights of these points, scene.dem; sign convention of a phase history; carrier; moving objects",
+        "core/imaging/focus_check.py",
+    ),
     "echo_outside_scene": Flag(
         "position of the strong echo",
         "the pulses contain a strong echo at ranges outside the scene, or a strong echo that does not focus at any "

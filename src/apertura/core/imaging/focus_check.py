@@ -22,7 +22,7 @@ from apertura.core.imaging.formation import PULSES_READ, Formation
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, RangeWindow, range_compress
 from apertura.core.imaging.view import ground_axes
 from apertura.core.quality.bright_points import SPECKLE, BrightPoint, PointResponse, bright_points
-from apertura.core.quality.focus import PointFocus, SubApertures, compare_parts, judge, judge_parts, point_focus
+from apertura.core.quality.focus import Focus, PointFocus, SubApertures, compare_parts, judge, judge_parts, point_focus
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.path_errors import Effect
 from apertura.core.scene.grid import SceneGrid
@@ -455,6 +455,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
         "verdict": verdict.verdict,
         **({"loss_db": round(verdict.loss_db, 3), "std_db": round(verdict.std_db, 3)} if verdict.points else {}),
         "reason": verdict.reason,
+        **({"uneven": line} if (line := _uneven(grid, points, measured, verdict)) else {}),
         **({"elsewhere": elsewhere} if elsewhere else {}),
         **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
@@ -465,6 +466,34 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
             _point_report(formation, point, focus) for point, focus in zip(points, measured, strict=True) if focus
         ],
     }
+
+
+_UNEVEN_DB, _UNEVEN_SIGMAS = -1.0, 5.0  # limits of eq. 1″
+
+
+def _uneven(
+    grid: SceneGrid, points: Sequence[BrightPoint], measured: Sequence[PointFocus | None], verdict: Focus
+) -> str | None:
+    """Return one line on points that lose more than the others; None if there are none, or all are defocused.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 1″.
+    """
+    pairs = [(point, focus) for point, focus in zip(points, measured, strict=True) if focus is not None]
+    worse = [
+        (focus.loss_db, point)
+        for point, focus in pairs
+        if focus.loss_db - verdict.loss_db < _UNEVEN_DB - _UNEVEN_SIGMAS * focus.std_db
+    ]
+    if verdict.verdict == "defocused" or not worse:
+        return None
+    loss_db, point = min(worse, key=lambda one: one[0])
+    x_m, y_m = (float(coordinate) for coordinate in grid.map_at(point.row, point.column))
+    return (
+        f"{len(worse)} of {len(pairs)} bright points lose at least {-max(loss for loss, _ in worse):.1f} dB, median "
+        f"{abs(verdict.loss_db):.1f} dB; most at ({x_m:.1f}, {y_m:.1f}): {-loss_db:.1f} dB"
+    )
 
 
 _CONJUGATED_LOSS_DB = -6.0  # loss beyond which the samples of a defocused image are tested for conjugation
@@ -505,7 +534,7 @@ points."""
 
 
 def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
-    """Evaluate the flags `defocused`, `loss_unexpected` and `echo_outside_scene`.
+    """Evaluate the flags `defocused`, `loss_unexpected`, `focus_uneven` and `echo_outside_scene`.
 
     Parameters
     ----------
@@ -520,6 +549,8 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
     points. The standard deviation of the expected loss describes the variation between flights.
     """
     flags = Flags({"echo_outside_scene": report["elsewhere"]} if "elsewhere" in report else {})
+    if "uneven" in report:
+        flags["focus_uneven"] = report["uneven"]
     budget = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB expected from the error budget"
     if report["verdict"] == "defocused":
         flags["defocused"] = (

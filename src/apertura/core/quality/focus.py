@@ -197,6 +197,11 @@ class PointFocus:
     coherence: float = 1.0
     coherence_noise_limit: float = 1.0
 
+    @property
+    def std_db(self) -> float:
+        """Standard deviation of the loss from noise and neighbours, dB."""
+        return 10 / float(np.log(10)) * self.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02
+
 
 def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
     """Measure the focus of a point; None if the point does not dominate its range cell over the whole aperture.
@@ -306,10 +311,7 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     if not measured:
         return Focus("inconclusive", float("nan"), float("nan"), 0, "no bright point")
     losses = np.array([focus.loss_db for _, focus in measured])
-    # Standard deviation of each loss from noise and neighbours.
-    stds = np.array(
-        [10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02 for _, focus in measured]
-    )
+    stds = np.array([focus.std_db for _, focus in measured])
     weights = np.array([amplitude for amplitude, _ in measured])
     loss = weighted_median(losses, weights)
     spread = 1.4826 * weighted_median(np.abs(losses - loss), weights)
