@@ -118,6 +118,24 @@ def test_files_of_a_node_are_joined_with_their_times(tmp_path):
     np.testing.assert_array_equal(both.transfer, transfer_of(beat, COFFEE))
 
 
+def test_repeated_sweeps_are_excluded(tmp_path):
+    beat = beats(STARTS_S) + np.random.default_rng(1).normal(0, 1e-3, (len(STARTS_S), COFFEE.sweep_samples))
+    beat[4:6] = beat[2:4]
+    np.save(tmp_path / "a.npy", beat)
+    np.save(tmp_path / "a.time.npy", STARTS_S)
+    read = echo("beat_npy", tmp_path / "a.npy", tmp_path / "a.time.npy")
+    assert read.attrs["flags"]["captures_repeated"] == "2 of 8 captures of a, first at capture 4"
+    assert read.attrs["dropped"] == {"captures_repeated": 2}
+    expected = transfer_of(np.delete(beat, [4, 5], axis=0), COFFEE)
+    np.testing.assert_allclose(read.transfer.values, expected, atol=1e-6)
+
+
+def test_complex_sweeps_without_imaginary_parts_are_rejected(tmp_path):
+    np.save(tmp_path / "a.npy", beats(STARTS_S).astype(np.complex64))
+    message = complaint(lambda: echo("beat_npy", tmp_path / "a.npy", iq="complex", prf_hz=25.0))
+    assert "the imaginary parts of all samples are zero, but waveform.iq is complex" in message
+
+
 def test_sweeps_without_times_follow_the_configured_rate_and_start(tmp_path):
     np.save(tmp_path / "a.npy", beats(STARTS_S))
     stage = echo("beat_npy", tmp_path / "a.npy", prf_hz=25.0)

@@ -182,10 +182,11 @@ _OF_RECORDINGS = {
         "formats/phase_histories/cphd.py",
     ),
     "captures_repeated": Flag(
-        "captures excluded, of the total number; number of the first",
-        "captures are bit-identical to earlier ones: the recorder wrote old samples again, which would cause ghosts",
+        "captures, sweeps or pulses excluded, of the total number; number of the first",
+        "captures are bit-identical to earlier ones: the recorder wrote old samples again, which would cause ghosts; "
+        "if all are identical, none is excluded from a phase history or from FMCW sweeps",
         "buffers of the recorder; the copy of the recording",
-        "stages/echo.py",
+        "core/echo/captures.py",
     ),
     "captures_limited": Flag(
         "captures affected, of the total number; crest factors of these and of the other captures, dB",

@@ -22,7 +22,7 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
-from apertura.core.echo.captures import runs, sampled_pulses, spread
+from apertura.core.echo.captures import repeat_flags, runs, sampled_pulses, spread
 from apertura.core.echo.compression import window_weights
 from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.frame_codes import displacement
@@ -228,7 +228,7 @@ def _attributes(
         },
         "flags": Flags.merged(
             pulses.flags,
-            _repeat_flags(rx, pulses, repeats),
+            repeat_flags(repeats, rx.name, first=int(pulses.rx_index[int(repeats.argmax())])),
             positions.flags,
             measured.flags,
             missing,
@@ -330,15 +330,6 @@ def _with_waveform(measured: Transfer, sent: Transmitted) -> Transfer:
         flags = Flags.merged(flags, cut)
     report = {**measured.report, **({"waveform": sent.report} if sent.report else {})}
     return replace(measured, flags=Flags.merged(measured.flags, flags), report=report)
-
-
-def _repeat_flags(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) -> Flags:
-    """Return a flag if captures of the receiver repeat earlier ones bit for bit; they are excluded."""
-    if not repeats.any():
-        return Flags()
-    first = int(pulses.rx_index[int(repeats.argmax())])
-    line = f"{int(repeats.sum())} of {len(repeats)} captures of {rx.name}, first at capture {first}"
-    return Flags({"captures_repeated": line})
 
 
 def _pulse_counts(

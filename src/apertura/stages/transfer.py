@@ -376,7 +376,8 @@ def _with_log_positions(campaign: Campaign, flight: str, nodes: tuple[str, str],
     axes: dict[str, Any] = {
         name: (("pulse", "axis", "body"), log.body_axes(at)) for name, log in rotating.items() if log
     }
-    reasons = {**history.attrs.get("dropped", {}), **positions.reasons}
+    recorded = history.attrs.get("pulses", {}).get("reasons", history.attrs.get("dropped", {}))
+    reasons = {**recorded, **positions.reasons}
     counts: dict[str, Any] = {"used": len(at), "dropped": sum(reasons.values()), "reasons": reasons}
     antennas = tx.antenna("radar_tx", at), rx.antenna("radar_rx", at)
     lasting_s = history.attrs.get("sweep_used_s", 0.0)

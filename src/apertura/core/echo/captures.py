@@ -1,6 +1,7 @@
 """Captures of a pair: reading in blocks of pulses, saturation check, and resampling to the transmitter's clock."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -232,6 +233,55 @@ class _Extreme:
             return
         earlier = self.times if value == self.value else 0
         self.value, self.times = value, earlier + int(np.count_nonzero(samples == value))
+
+
+# ---- Captures that repeat earlier ones
+
+HEAD = 16
+"""Samples of a capture compared first, so that few captures are read completely."""
+
+
+def repeated(heads: Iterable[NDArray[Any]], whole: Callable[[int], NDArray[Any]]) -> NDArray[np.bool_]:
+    """Find captures that are bit-identical to an earlier capture, which noise would prevent.
+
+    Parameters
+    ----------
+    heads
+        Some samples of each capture, in order; captures whose heads are unique are not read further.
+    whole
+        Function that returns all samples of a capture.
+
+    Returns
+    -------
+    ndarray
+        (capture,) bool.
+
+    Examples
+    --------
+    >>> captures = np.array([[1, 2, 3], [1, 2, 4], [5, 6, 7], [1, 2, 3]])
+    >>> repeated(captures[:, :2], lambda number: captures[number]).tolist()
+    [False, False, False, True]
+    """
+    count, candidates = 0, dict[bytes, list[int]]()
+    for head in heads:
+        candidates.setdefault(head.tobytes(), []).append(count)
+        count += 1
+    repeats = np.zeros(count, bool)
+    for numbers in candidates.values():
+        known = set[bytes]()
+        for number in numbers if len(numbers) > 1 else ():
+            digest = hashlib.blake2b(whole(number).tobytes(), digest_size=16).digest()
+            repeats[number] = digest in known
+            known.add(digest)
+    return repeats
+
+
+def repeat_flags(repeats: NDArray[np.bool_], node: str, *, first: int, remark: str = "") -> Flags:
+    """Return a flag if captures of a node repeat earlier ones; `first`: number of the first of them."""
+    if not repeats.any():
+        return Flags()
+    line = f"{int(repeats.sum())} of {len(repeats)} captures of {node}, first at capture {first}{remark}"
+    return Flags({"captures_repeated": line})
 
 
 # ---- Correction of clock offsets

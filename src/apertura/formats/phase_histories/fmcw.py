@@ -1,5 +1,6 @@
 """Beat signals of FMCW radars as arrays (.npy, .mat) or audio (.wav), read as stage `echo` without positions."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -16,6 +17,7 @@ from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.npy import read_npy
 from apertura.formats.phase_histories import fmcw_fields
+from apertura.formats.phase_histories.phase_history import distinct
 from apertura.formats.times import utc_times
 
 # ---- Beat signals of FMCW radars as arrays (.npy, .mat) -------------------------------------------------------------
@@ -155,19 +157,24 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
         If sweeps are too short, contradict waveform.iq, or contain values that are not finite, or if times are missing
         or do not increase.
     """
-    sweep, dropped = sweep_of(described), dict[str, int]()
-    times, transfers = list[Times](), list[NDArray[np.complex64]]()
+    sweep, dropped = sweep_of(described), Counter[str]()
+    all_starts, echoes = list[Times](), list[NDArray[np.bool_]]()
     for file in read:
         _check(file, sweep, described)
         starts = _regular(file, described, is_single=len(read) == 1) if file.time is None else file.time
         if len(starts) != len(file.beat):
             raise _error(f"{len(starts)} times for {len(file.beat)} sweeps", file.path)
-        has_signal = file.beat[:, sweep.first : sweep.sweep_samples].any(axis=1)
-        excluded = {**(file.dropped or {}), "all samples zero": int((~has_signal).sum())}
-        dropped = {reason: dropped.get(reason, 0) + excluded.get(reason, 0) for reason in {**dropped, **excluded}}
-        late_s = None if file.late_s is None else file.late_s[has_signal]
-        times.append(starts[has_signal])
-        transfers.append(transfer_of(file.beat[has_signal], sweep, late_s=late_s))
+        all_starts.append(starts)
+        echoes.append(np.asarray(file.beat[:, sweep.first : sweep.sweep_samples].any(axis=1)))
+        dropped.update({**(file.dropped or {}), "all samples zero": int((~echoes[-1]).sum())})
+    used = [file.beat[:, sweep.first : sweep.sweep_samples] for file in read]
+    kept, flags, repeats = distinct(used, echoes, node=pair.rpartition("-")[2])
+    dropped.update(repeats)
+    times, transfers = list[Times](), list[NDArray[np.complex64]]()
+    for file, starts, mask in zip(read, all_starts, kept, strict=True):
+        late_s = None if file.late_s is None else file.late_s[mask]
+        times.append(starts[mask])
+        transfers.append(transfer_of(file.beat[mask], sweep, late_s=late_s))
     time = np.concatenate(times) + np.timedelta64(round(sweep.middle_s * 1e9), "ns")
     if not len(time):
         raise _error("no sweep with a non-zero sample", read[0].path)
@@ -189,7 +196,7 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
         },
         attrs={
             "pair": pair,
-            "flags": {},
+            "flags": flags,
             "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
             "dropped": {reason: count for reason, count in dropped.items() if count},
             "sweep_used_s": sweep.samples / sweep.sample_rate_hz,
@@ -210,6 +217,8 @@ def _check(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) ->
         raise _error(f"{beat.dtype} of shape {beat.shape}; a sweep has {sweep.sweep_samples} samples", file.path)
     if (beat.dtype.kind == "c") != (sweep.iq != "real"):
         raise _error(f"{beat.dtype} samples, but waveform.iq is {sweep.iq}", file.path)
+    if beat.dtype.kind == "c" and beat.real.any() and not beat.imag.any():
+        raise _error(f"the imaginary parts of all samples are zero, but waveform.iq is {sweep.iq}", file.path)
     with np.errstate(invalid="ignore"):
         bad = np.flatnonzero(~(np.abs(beat).max(axis=1) < _LARGEST))
     if bad.size:
