@@ -180,6 +180,15 @@ def test_real_transfer_functions_are_rejected(tmp_path, kind):
     assert read(kind, write(tmp_path / f"c{SUFFIX[kind]}", fields)).sizes["pulse"] == PULSES
 
 
+@FORMATS
+@pytest.mark.parametrize(("scale", "expected"), [(1e-20, "transfer reaches only"), (1e20, "transfer reaches")])
+def test_samples_beyond_the_range_of_computations_are_rejected(tmp_path, kind, scale, expected):
+    fields = arrays()
+    fields["transfer"] *= np.float32(scale)
+    path = write(tmp_path / f"b{SUFFIX[kind]}", fields)
+    assert expected in complaint(lambda: read(kind, path))
+
+
 def test_external_hdf5_array_is_rejected(tmp_path):
     inner, other = tmp_path / "b.h5", tmp_path / "secret"
     np.arange(PULSES, dtype=np.float64).tofile(other)

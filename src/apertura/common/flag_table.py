@@ -102,6 +102,12 @@ _OF_RECORDINGS = {
         "the recorder; the copy of the file",
         "formats/phase_histories/pulson.py",
     ),
+    "sweep_idle": Flag(
+        "decrease of the power along the sweep, dB; its time after the start of the sweep; waveform.sweep_s, s",
+        "the end of the rows contains only noise: the sweep ends earlier than configured, which scales ranges wrongly",
+        "waveform.sweep_s and waveform.bandwidth_hz, which are those of the linear part without idle time",
+        "core/echo/dechirp.py",
+    ),
     "sweep_motion": Flag(
         "path change per sweep, wavelengths; displacement of echoes, m",
         "the antennas move during a sweep: envelope and phase of an echo correspond to different ranges",

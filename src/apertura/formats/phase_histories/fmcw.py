@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.core.echo.dechirp import FrequencySweep, transfer_of
+from apertura.common.flags import Flags
+from apertura.core.echo.captures import Saturation, blocks_of
+from apertura.core.echo.dechirp import FrequencySweep, SweepPower, transfer_of
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.npy import read_npy
 from apertura.formats.phase_histories import fmcw_fields
-from apertura.formats.phase_histories.phase_history import distinct
+from apertura.formats.phase_histories.phase_history import LARGEST, LEAST, distinct
 from apertura.formats.times import utc_times
 
 # ---- Beat signals of FMCW radars as arrays (.npy, .mat) -------------------------------------------------------------
@@ -26,9 +28,6 @@ from apertura.formats.times import utc_times
 
 _TIMES = ".time.npy"
 _MOST_VALUES = 1 << 34
-_LARGEST = 1e15
-"""Largest accepted sample; its square is within the range of float32."""
-
 _FARTHEST_S = 2.0**33
 """Limit of times since 1970, s, within the range of int64 nanoseconds."""
 
@@ -43,6 +42,10 @@ The value is below 1, because float64 seconds since 1970 have a resolution of 0.
 
 _MOST_INTERVALS = 1.05
 """Maximum duration of a row of samples relative to the interval between sweeps."""
+
+_CLIPPED_CONTRAST = 4.0
+"""Frequency of the extreme value of a clipped beat signal relative to the adjacent value, at least; 2.4 at the crest of
+a stable tone."""
 
 _EXPECTED = "beat signals (sweep, sample), real or complex as configured in waveform.iq, all finite"
 _REMEDY = "Correct the file, or waveform in the config."
@@ -171,7 +174,12 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
     kept, flags, repeats = distinct(used, echoes, node=pair.rpartition("-")[2])
     dropped.update(repeats)
     times, transfers = list[Times](), list[NDArray[np.complex64]]()
+    saturation, power = Saturation(_CLIPPED_CONTRAST), SweepPower(sweep)
     for file, starts, mask in zip(read, all_starts, kept, strict=True):
+        for block in blocks_of(np.flatnonzero(mask)):
+            samples = file.beat[block, sweep.first : sweep.sweep_samples]
+            saturation.count({"radar": _parts(samples)})
+            power.count(samples)
         late_s = None if file.late_s is None else file.late_s[mask]
         times.append(starts[mask])
         transfers.append(transfer_of(file.beat[mask], sweep, late_s=late_s))
@@ -196,12 +204,17 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
         },
         attrs={
             "pair": pair,
-            "flags": flags,
+            "flags": Flags.merged(flags, saturation.clipped, power.flags),
             "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
             "dropped": {reason: count for reason, count in dropped.items() if count},
             "sweep_used_s": sweep.samples / sweep.sample_rate_hz,
         },
     )
+
+
+def _parts(beat: NDArray[Any]) -> NDArray[Any]:
+    """Return the real part of beat signals and, if they are complex, the imaginary part: (sweep, sample, part)."""
+    return np.stack([beat.real, beat.imag], -1) if np.iscomplexobj(beat) else np.asarray(beat)[..., None]
 
 
 def _check(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> None:
@@ -220,13 +233,17 @@ def _check(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) ->
     if beat.dtype.kind == "c" and beat.real.any() and not beat.imag.any():
         raise _error(f"the imaginary parts of all samples are zero, but waveform.iq is {sweep.iq}", file.path)
     with np.errstate(invalid="ignore"):
-        bad = np.flatnonzero(~(np.abs(beat).max(axis=1) < _LARGEST))
+        magnitude = np.abs(beat).max(axis=1)
+    bad = np.flatnonzero(~(magnitude < LARGEST))
     if bad.size:
         raise _error(
-            f"sweep {int(bad[0])} contains a sample that is not a number or exceeds {_LARGEST:g} ({bad.size} such "
+            f"sweep {int(bad[0])} contains a sample that is not a number or exceeds {LARGEST:g} ({bad.size} such "
             "sweeps)",
             file.path,
         )
+    if 0 < magnitude.max() < LEAST:
+        found = f"the largest sample is {magnitude.max():.3g}, at least {LEAST:g} is accepted"
+        raise CampaignError(found, file.path, _EXPECTED, "Multiply the samples by a constant.")
 
 
 def _is_by_columns(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> bool:

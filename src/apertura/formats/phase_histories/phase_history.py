@@ -19,8 +19,8 @@ from apertura.core.echo.captures import HEAD, repeat_flags, repeated
 if TYPE_CHECKING:
     import xarray as xr
 
-LARGEST = 1e30
-"""Largest sample accepted."""
+LARGEST, LEAST = 1e15, 1e-12
+"""Limits of the largest sample: powers of samples and of noise 60 dB below are within the range of float32."""
 
 LOWEST_HZ = 1e6
 """Lowest frequency of an imaging radar, Hz; smaller numbers are in MHz or GHz."""
@@ -93,7 +93,7 @@ class History:
 
 
 def largest_by_row(
-    name: str, values: Samples, largest: float, refuse: Callable[[str], CampaignError]
+    name: str, values: Samples, largest: float, refuse: Callable[[str], CampaignError], *, least: float = 0.0
 ) -> NDArray[np.float64]:
     """Return the largest magnitude of each row of an array, read in blocks.
 
@@ -107,11 +107,13 @@ def largest_by_row(
         Largest accepted magnitude.
     refuse
         Function that returns the error to raise from a description of the fault.
+    least
+        Smallest accepted magnitude of the largest value, unless all values are zero.
 
     Raises
     ------
     CampaignError
-        If a value is not finite or exceeds `largest`.
+        If a value is not finite or exceeds `largest`, or the largest value is below `least`.
 
     Examples
     --------
@@ -129,6 +131,10 @@ def largest_by_row(
         maxima[first : first + step] = np.abs(block).reshape(len(block), -1).max(axis=1)
     if rows and maxima.max() > largest:
         raise refuse(f"{name} reaches {maxima.max():.3g}, at most {largest:g} is accepted")
+    if rows and 0 < maxima.max() < least:
+        raise refuse(
+            f"{name} reaches only {maxima.max():.3g}, at least {least:g} is accepted (multiply it by a constant)"
+        )
     return maxima
 
 
