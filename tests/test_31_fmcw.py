@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from folders import complaint
 from scipy.io import savemat, wavfile
+from scipy.signal import get_window
 
 from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.formats.phase_histories.fmcw import trigger_starts
@@ -116,6 +117,97 @@ def test_files_of_a_node_are_joined_with_their_times(tmp_path):
         np.save(tmp_path / f"a.{part}.time.npy", (BEGAN + (STARTS_S[rows] * 1e9).astype("timedelta64[ns]")))
     both = echo("beat_npy", *sorted(tmp_path.glob("a*.npy")))
     np.testing.assert_array_equal(both.transfer, transfer_of(beat, COFFEE))
+
+
+def test_repeated_sweeps_are_excluded(tmp_path):
+    beat = beats(STARTS_S) + np.random.default_rng(1).normal(0, 1e-3, (len(STARTS_S), COFFEE.sweep_samples))
+    beat[4:6] = beat[2:4]
+    np.save(tmp_path / "a.npy", beat)
+    np.save(tmp_path / "a.time.npy", STARTS_S)
+    read = echo("beat_npy", tmp_path / "a.npy", tmp_path / "a.time.npy")
+    assert read.attrs["flags"]["captures_repeated"] == "2 of 8 captures of a, first at capture 4"
+    assert read.attrs["dropped"] == {"captures_repeated": 2}
+    expected = transfer_of(np.delete(beat, [4, 5], axis=0), COFFEE)
+    np.testing.assert_allclose(read.transfer.values, expected, atol=1e-6)
+
+
+def test_complex_sweeps_without_imaginary_parts_are_rejected(tmp_path):
+    np.save(tmp_path / "a.npy", beats(STARTS_S).astype(np.complex64))
+    message = complaint(lambda: echo("beat_npy", tmp_path / "a.npy", iq="complex", prf_hz=25.0))
+    assert "the imaginary parts of all samples are zero, but waveform.iq is complex" in message
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32, np.complex64])
+@pytest.mark.parametrize(("level", "flagged"), [(0.7, True), (0.4, False)])
+def test_clipping_converter_is_flagged(tmp_path, dtype, level, flagged):
+    """Full scale is 1.5 times the weaker target at level 1; without clipping, the stable tone repeats its crest."""
+    iq = "complex" if dtype == np.complex64 else "real"
+    sweep = replace(COFFEE, iq=iq)
+    beat = beats(STARTS_S, sweep) * 2048 * level
+    beat = beat + np.random.default_rng(1).normal(0, 3, beat.shape)
+    recorded = np.clip(beat.real.round(), -2048, 2047)
+    if iq == "complex":
+        recorded = recorded + 1j * np.clip(beat.imag.round(), -2048, 2047)
+    np.save(tmp_path / "a.npy", recorded.astype(dtype))
+    flags = echo("beat_npy", tmp_path / "a.npy", prf_hz=25.0, iq=iq).attrs["flags"]
+    assert ("saturated_radar" in flags) is flagged
+    assert set(flags) <= {"saturated_radar"}
+
+
+def test_stable_tone_without_clipping_is_not_flagged(tmp_path):
+    """The direct path is so strong and stable that each sweep reaches the same codes."""
+    beat = beat_signal(COFFEE, STARTS_S, [lambda time: np.full_like(time, 60.0)], [1000.0])
+    beat += np.random.default_rng(1).normal(0, 0.5, beat.shape)
+    np.save(tmp_path / "a.npy", beat.round().astype(np.int16))
+    assert echo("beat_npy", tmp_path / "a.npy", prf_hz=25.0).attrs["flags"] == {}
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1e20])
+def test_beat_signals_beyond_the_range_of_computations_are_rejected(tmp_path, scale):
+    np.save(tmp_path / "a.npy", beats(STARTS_S) * scale)
+    assert "sample" in complaint(lambda: echo("beat_npy", tmp_path / "a.npy", prf_hz=25.0))
+
+
+LONG = 0.05 + 0.040004 * np.arange(100)
+
+
+@pytest.mark.parametrize(
+    ("noise", "idle", "flagged"),
+    [
+        (0.1, 0.1, True),
+        (0.1, 0.06, True),
+        (0.1, 0.03, True),
+        (0.1, 0.01, False),
+        (0.1, 0.0, False),
+        (1.0, 0.1, True),
+        (10.0, 0.1, False),
+    ],
+)
+@pytest.mark.parametrize("iq", ["real", "complex"])
+def test_idle_time_at_the_end_of_sweeps_is_flagged(tmp_path, iq, noise, idle, flagged):
+    """Noise relative to the moving target at amplitude 0.5; idle time relative to the sweep. The direct path is
+    constant."""
+    sweep = replace(COFFEE, iq=iq)
+    beat = beats(LONG, sweep)
+    beat[:, round((1 - idle) * beat.shape[1]) :] = 0
+    rng = np.random.default_rng(1)
+    beat = beat + 0.5 * noise * rng.standard_normal(beat.shape)
+    if iq == "complex":
+        beat = beat + 0.5j * noise * rng.standard_normal(beat.shape)
+    np.save(tmp_path / "a.npy", beat)
+    flags = echo("beat_npy", tmp_path / "a.npy", prf_hz=24.0, iq=iq).attrs["flags"]
+    assert set(flags) == ({"sweep_idle"} if flagged else set())
+    if flagged:
+        stated_s = float(re.search(r"after (\S+) s", flags["sweep_idle"])[1])
+        assert stated_s == pytest.approx((1 - idle) * COFFEE.sweep_s, abs=0.03 * COFFEE.sweep_s)
+
+
+@pytest.mark.parametrize("window", ["hann", "hamming", "blackman", ("tukey", 0.1), ("kaiser", 6.0), ("taylor", 4)])
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_window_of_the_recorder_is_not_taken_for_idle_time(tmp_path, window, noise):
+    beat = beats(LONG) + noise * np.random.default_rng(1).standard_normal((len(LONG), COFFEE.sweep_samples))
+    np.save(tmp_path / "a.npy", beat * get_window(window, beat.shape[1], fftbins=False))
+    assert echo("beat_npy", tmp_path / "a.npy", prf_hz=24.0).attrs["flags"] == {}
 
 
 def test_sweeps_without_times_follow_the_configured_rate_and_start(tmp_path):

@@ -146,6 +146,49 @@ def test_silent_pulses_are_dropped_and_counted(tmp_path):
     assert echo.attrs["pulses"] == {"used": PULSES - 1, "dropped": 1, "reasons": {"all samples zero": 1}}
 
 
+@FORMATS
+def test_repeated_pulses_of_all_files_are_excluded(tmp_path, kind):
+    first, second = arrays(), arrays()
+    second["time"] += 10**12
+    second["transfer"] = first["transfer"].copy()
+    second["transfer"][0] *= 2
+    paths = [write(tmp_path / f"b.{number}{SUFFIX[kind]}", part) for number, part in enumerate((first, second))]
+    echo = read(kind, *paths)
+    counted = {"used": PULSES + 1, "dropped": PULSES - 1, "reasons": {"captures_repeated": PULSES - 1}}
+    assert echo.attrs["pulses"] == counted
+    line = f"{PULSES - 1} of {2 * PULSES} captures of b, first at capture {PULSES + 1}"
+    assert echo.attrs["flags"]["captures_repeated"] == line
+    np.testing.assert_array_equal(echo.transfer[PULSES], second["transfer"][0])
+
+
+def test_echo_of_the_reference_point_alone_is_kept(tmp_path):
+    """Without noise, all its samples are 1: identical pulses without imaginary parts."""
+    fields = arrays()
+    fields["transfer"] = np.ones_like(fields["transfer"])
+    echo = read("hdf5", write(tmp_path / "b.h5", fields))
+    assert echo.sizes["pulse"] == PULSES
+    assert "not excluded" in echo.attrs["flags"]["captures_repeated"]
+
+
+@FORMATS
+def test_real_transfer_functions_are_rejected(tmp_path, kind):
+    fields = arrays()
+    fields["transfer"] = (fields["transfer"].real + 0j).astype(np.complex64)
+    path = write(tmp_path / f"b{SUFFIX[kind]}", fields)
+    assert "the imaginary parts of all samples are zero" in complaint(lambda: read(kind, path))
+    fields["transfer"][-1, -1] += 1e-3j
+    assert read(kind, write(tmp_path / f"c{SUFFIX[kind]}", fields)).sizes["pulse"] == PULSES
+
+
+@FORMATS
+@pytest.mark.parametrize(("scale", "expected"), [(1e-20, "transfer reaches only"), (1e20, "transfer reaches")])
+def test_samples_beyond_the_range_of_computations_are_rejected(tmp_path, kind, scale, expected):
+    fields = arrays()
+    fields["transfer"] *= np.float32(scale)
+    path = write(tmp_path / f"b{SUFFIX[kind]}", fields)
+    assert expected in complaint(lambda: read(kind, path))
+
+
 def test_external_hdf5_array_is_rejected(tmp_path):
     inner, other = tmp_path / "b.h5", tmp_path / "secret"
     np.arange(PULSES, dtype=np.float64).tofile(other)

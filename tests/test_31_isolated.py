@@ -41,7 +41,8 @@ def read(*paths):
 
 
 def test_arrays_are_returned_from_the_process_unchanged(tmp_path):
-    echo = read(history(tmp_path / "b.mat", z=np.full(PULSES, 7001.0)), history(tmp_path / "a.mat"))
+    others = np.exp(-1j * np.arange(1, 1 + PULSES * LINES).reshape(LINES, PULSES))
+    echo = read(history(tmp_path / "b.mat", fp=others, z=np.full(PULSES, 7001.0)), history(tmp_path / "a.mat"))
     assert echo.transfer.shape == (2 * PULSES, LINES)
     np.testing.assert_array_equal(echo.tx_position.values[[0, -1], 2], [7000.0, 7001.0])  # in order of file names
     np.testing.assert_allclose(echo.transfer.values[1], np.exp(1j * (1 + PULSES * np.arange(LINES))), atol=1e-6)

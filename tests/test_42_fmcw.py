@@ -160,6 +160,23 @@ def test_antenna_motion_during_a_slow_sweep_is_flagged(tmp_path):
     assert "0.64 wavelengths" in flags["sweep_motion"]
 
 
+@pytest.mark.parametrize("sweeps", [1, 2, 3])
+def test_fewer_than_three_sweeps_are_refused(tmp_path, sweeps):
+    campaign = Campaign.load(write_campaign(tmp_path, replace(FLIGHT, sweeps=sweeps)))
+    if sweeps < 3:
+        message = complaint(lambda: recorded_echo(campaign, "f01", "uav1-uav1"))
+        assert re.search(rf"{sweeps} pulses? with samples and positions; expected at least 3", message)
+    else:
+        assert recorded_echo(campaign, "f01", "uav1-uav1").sizes["pulse"] == sweeps
+
+
+def test_sweep_of_few_samples_is_refused_with_their_number(tmp_path):
+    root = write_campaign(tmp_path, replace(FLIGHT, sweeps=20), settle_s=19.6e-6)
+    assert "10 subcarriers yield 20 range samples; expected more than the 64 samples" in complaint(
+        lambda: process(root)
+    )
+
+
 def test_missing_sweeps_are_counted_and_flagged(tmp_path):
     root = write_campaign(tmp_path)
     beat = np.load(root / "raw/f01/uav1.npy")

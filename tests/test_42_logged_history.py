@@ -17,6 +17,7 @@ from apertura.formats.names import PHASE_HISTORIES, HistoryFormat
 from apertura.formats.tracks.csv_track import read_csv_track
 from apertura.run.process import process
 from apertura.stages import tracks
+from apertura.stages.transfer import recorded_echo
 from apertura.tools.preview.follow import Preview
 
 CRS = "EPSG:32632"
@@ -203,3 +204,38 @@ def test_preview_of_a_phase_history_works_without_follow(campaign):
     assert (status["peak"]["x_m"] - EAST, status["peak"]["y_m"] - NORTH) == (1.0, 20.0)
     assert (status["verdict"], status["pulses"]["added"]) == ("focused", 600)
     assert "waveform.kind phase_history" in complaint(lambda: Preview(Campaign.load(campaign), follow=True))
+
+
+@pytest.fixture
+def placed(campaign, monkeypatch):
+    """Return a function that stores antenna positions with the samples, in place of the flight log."""
+
+    def place(moved_m):
+        def read(paths, *, pair):
+            history = read_toy_history(paths, pair=pair)
+            along = np.linspace(-moved_m / 2, moved_m / 2, history.sizes["pulse"])
+            positions = (("pulse", "axis"), position_ecef(along, np.zeros_like(along), np.full_like(along, 10.0)))
+            return history.assign(tx_position=positions, rx_position=positions).assign_attrs(frame="ecef")
+
+        monkeypatch.setitem(PHASE_HISTORIES, "toy", HistoryFormat(".npz", read))
+        (campaign / "raw/f01/uav1.track.csv").unlink()
+        edit_config(campaign, lambda document: document["nodes"]["uav1"].update(position_std_m=0.01))
+        edit_config(campaign, lambda document: document["nodes"]["uav1"].pop("log"))
+        return campaign
+
+    return place
+
+
+def test_equal_positions_of_all_pulses_are_refused(placed):
+    campaign = Campaign.load(placed(0.0))
+    message = complaint(lambda: recorded_echo(campaign, "f01", "uav1-uav1"))
+    assert "the antenna positions of all pulses are equal" in message
+
+
+@pytest.mark.slow
+def test_tracks_without_an_aperture_are_not_refined(placed):
+    """The points of the scene are kilometres wide across the line of sight: no patch fits in memory."""
+    root = placed(1e-6)
+    opened = process(root, last="cube")
+    image = open_stage(opened.stage("image", "f01", "uav1-uav1"), "image")
+    assert "no_aperture" in image.attrs["quality"]["flags"]

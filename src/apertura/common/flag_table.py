@@ -102,6 +102,12 @@ _OF_RECORDINGS = {
         "the recorder; the copy of the file",
         "formats/phase_histories/pulson.py",
     ),
+    "sweep_idle": Flag(
+        "decrease of the power along the sweep, dB; its time after the start of the sweep; waveform.sweep_s, s",
+        "the end of the rows contains only noise: the sweep ends earlier than configured, which scales ranges wrongly",
+        "waveform.sweep_s and waveform.bandwidth_hz, which are those of the linear part without idle time",
+        "core/echo/dechirp.py",
+    ),
     "sweep_motion": Flag(
         "path change per sweep, wavelengths; displacement of echoes, m",
         "the antennas move during a sweep: envelope and phase of an echo correspond to different ranges",
@@ -182,10 +188,11 @@ _OF_RECORDINGS = {
         "formats/phase_histories/cphd.py",
     ),
     "captures_repeated": Flag(
-        "captures excluded, of the total number; number of the first",
-        "captures are bit-identical to earlier ones: the recorder wrote old samples again, which would cause ghosts",
+        "captures, sweeps or pulses excluded, of the total number; number of the first",
+        "captures are bit-identical to earlier ones: the recorder wrote old samples again, which would cause ghosts; "
+        "if all are identical, none is excluded from a phase history or from FMCW sweeps",
         "buffers of the recorder; the copy of the recording",
-        "stages/echo.py",
+        "core/echo/captures.py",
     ),
     "captures_limited": Flag(
         "captures affected, of the total number; crest factors of these and of the other captures, dB",

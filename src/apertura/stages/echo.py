@@ -22,7 +22,7 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
-from apertura.core.echo.captures import runs, sampled_pulses, spread
+from apertura.core.echo.captures import repeat_flags, runs, sampled_pulses, spread
 from apertura.core.echo.compression import window_weights
 from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.frame_codes import displacement
@@ -44,7 +44,7 @@ from apertura.stages.calibration import calibrated, calibration_spec
 from apertura.stages.positions import PulsePositions, place, scene_air, stated_air
 from apertura.stages.symbols import PairSymbols, ambiguous_symbols, rows_of
 from apertura.stages.tags import stamped
-from apertura.stages.transfer import PairEcho, demodulator_of, recorded_echo, save_transfer
+from apertura.stages.transfer import FEWEST_PULSES, PairEcho, demodulator_of, recorded_echo, save_transfer
 from apertura.stages.transmitted import Transmitted, transmitted
 from apertura.workflow.lineage import result_of
 
@@ -90,10 +90,6 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     else:
         save_transfer(formed, stamped(formed.hollow, "echo", **origin), folder, lineage)
     return folder
-
-
-_FEWEST_PULSES = 3
-"""Smallest number of pulses of an echo: positions, rates and interference follow from neighbouring pulses."""
 
 
 def pair_echo(
@@ -185,11 +181,11 @@ def pair_echo(
 
 def _check_number(used: int, pulses: Association, rx: Acquisition) -> None:
     """Raise CampaignError if too few pulses remain for an image."""
-    if used < _FEWEST_PULSES:
+    if used < FEWEST_PULSES:
         raise CampaignError(
             f"{used} of {len(pulses.rx_index)} common pulses remain",
             where=rx.recording,
-            expected=f"at least {_FEWEST_PULSES} pulses with good positions and the transmitted code",
+            expected=f"at least {FEWEST_PULSES} pulses with good positions and the transmitted code",
             remedy="Check waveform.codes (file, seed, constellation, pilots), waveform.iq, and channels, time tags and "
             "logs of both nodes.",
         )
@@ -228,7 +224,7 @@ def _attributes(
         },
         "flags": Flags.merged(
             pulses.flags,
-            _repeat_flags(rx, pulses, repeats),
+            repeat_flags(repeats, rx.name, first=int(pulses.rx_index[int(repeats.argmax())])),
             positions.flags,
             measured.flags,
             missing,
@@ -330,15 +326,6 @@ def _with_waveform(measured: Transfer, sent: Transmitted) -> Transfer:
         flags = Flags.merged(flags, cut)
     report = {**measured.report, **({"waveform": sent.report} if sent.report else {})}
     return replace(measured, flags=Flags.merged(measured.flags, flags), report=report)
-
-
-def _repeat_flags(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) -> Flags:
-    """Return a flag if captures of the receiver repeat earlier ones bit for bit; they are excluded."""
-    if not repeats.any():
-        return Flags()
-    first = int(pulses.rx_index[int(repeats.argmax())])
-    line = f"{int(repeats.sum())} of {len(repeats)} captures of {rx.name}, first at capture {first}"
-    return Flags({"captures_repeated": line})
 
 
 def _pulse_counts(

@@ -500,11 +500,19 @@ def ranges_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWind
         beams=weighing(campaign, pair, scene),
         wave_speed_m_s=pair.wave_speed_m_s,
     )
-    _check_unambiguous(window)
+    _check_unambiguous(window, subcarriers=len(pair.frequency_hz))
     return window
 
 
-def _check_unambiguous(window: RangeWindow) -> None:
+def _check_unambiguous(window: RangeWindow, *, subcarriers: int) -> None:
+    if window.unambiguous <= 2 * GUARD_SAMPLES:
+        raise CampaignError(
+            f"{subcarriers} subcarriers yield {window.unambiguous} range samples",
+            where=f"{CONFIG}: waveform",
+            expected=f"more than the {2 * GUARD_SAMPLES} samples that the image needs before and behind the scene",
+            remedy="Use more subcarriers; of an FMCW radar, more samples of a sweep (waveform.settle_s, "
+            "waveform.sweep_s, waveform.sample_rate_hz).",
+        )
     if window.samples > window.unambiguous:
         spans_m, most_m = (
             (count - 2 * GUARD_SAMPLES) * window.step_m for count in (window.samples, window.unambiguous)

@@ -12,16 +12,18 @@ from numpy.typing import NDArray
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, save_stage
 from apertura.common.arrays import Floats, Times
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.common.units import seconds_since
 from apertura.core.backprojection.inputs import Profiles
+from apertura.core.echo.compression import centre_frequency
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.decisions import decide_autofocus
-from apertura.core.planning.plan import Decision
+from apertura.core.planning.plan import Decision, no_aperture
 from apertura.core.quality.budget import NodePositions
 from apertura.core.quality.path_errors import Effect
 from apertura.methods.autofocus.evidence import FOLDS
@@ -51,9 +53,18 @@ ONE_PHASE = "minimum_entropy"
 """Method of `auto` if one phase per pulse suffices; its results are accepted at least as often as phase_gradient's."""
 
 
+_CORNERS = 2
+"""Points along each side of the scene at which the length of the aperture is evaluated."""
+
+
 def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> tuple[Decision, ...]:
     """Decide on the refinement of a flight's tracks and on its method; `pairs` are all pairs of the flight."""
     requested = campaign.settings.processing
+    ground_m = scene.grid.sample_points(_CORNERS, scene.level.height_m)
+    for pair in pairs:
+        wave_m = SPEED_OF_LIGHT_M_S / centre_frequency(pair.frequency_hz)
+        if still := no_aperture(pair.aperture, ground_m, wavelength_m=wave_m):
+            return (Decision("autofocus", "off", f"{pair.name}: {still}"),)
     unstated = [node for node, accuracy in positions_of(pairs).items() if accuracy.std_m is None]
     loss_db = {pair.name: positions_loss_db(campaign, pair, scene) for pair in pairs}
     decision = decide_autofocus(requested.autofocus, loss_db, unstated)

@@ -18,7 +18,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import finish, open_stage, write_blocks, writing
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.common.units import nanoseconds, seconds_since
 from apertura.core.echo.association import missing_flags
@@ -320,23 +320,30 @@ def _correction(stage: xr.Dataset) -> Correction | None:
 # ---- Recorders that store transfer functions: FMCW, phase history ---------------------------------------------------
 
 
+FEWEST_PULSES = 3
+"""Smallest number of pulses of an echo: positions, rates and interference follow from neighbouring pulses."""
+
+
 def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
     """Return the echo of a pair as a recorder stored it, with times on the clock of the flight log.
 
     Raises
     ------
     CampaignError
-        If positions are stored neither with the samples nor in a flight log, or in both; or if their frame is not that
-        of the scene.
+        If positions are stored neither with the samples nor in a flight log, or in both; if their frame is not that of
+        the scene; or if there are fewer than `FEWEST_PULSES` pulses, or all
+        their positions are equal.
     """
     tx, rx = pair.split("-")
     history = read_history(campaign, flight, rx, pair=pair)
+    where = campaign.history_files(flight, rx)[0]
+    _check_number(history, where)
     history = history.assign(time=("pulse", campaign.clock(flight, rx).utc(history.time.values)))
     logged, has_positions = campaign.logged(flight, tx), "tx_position" in history
     if logged == has_positions:
         raise CampaignError(
             "positions both with the samples and in a flight log" if logged else "samples without positions",
-            where=campaign.history_files(flight, rx)[0],
+            where=where,
             expected="positions from a single source: either stored with the samples or read from a flight log "
             "raw/<flight>/<node>.track.*",
             remedy="Remove one of them." if logged else "Copy the flight log there.",
@@ -352,10 +359,29 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
             expected=LOCAL if local else "an EPSG code, or auto",
             remedy="Correct scene.crs.",
         )
+    legs = (history.tx_position.values, history.rx_position.values)
+    if all((position_m == position_m[0]).all() for position_m in legs):
+        raise CampaignError(
+            "the antenna positions of all pulses are equal",
+            where=where,
+            expected="antennas that move: without an aperture, no image can be formed",
+            remedy="Store the positions at each pulse.",
+        )
     history = in_air(campaign, history)
     nodes = campaign.settings.nodes
     accuracies = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
     return history.assign_attrs(positions=accuracies)
+
+
+def _check_number(history: xr.Dataset, where: Path) -> None:
+    """Raise CampaignError if too few pulses remain for an image."""
+    if history.sizes["pulse"] < FEWEST_PULSES:
+        raise CampaignError(
+            f"{number_of(history.sizes['pulse'], 'pulse')} with samples and positions",
+            where=where,
+            expected=f"at least {FEWEST_PULSES}",
+            remedy="Check that the recording is complete, and that its times are those of the flight log.",
+        )
 
 
 def _with_log_positions(campaign: Campaign, flight: str, nodes: tuple[str, str], history: xr.Dataset) -> xr.Dataset:
@@ -370,13 +396,15 @@ def _with_log_positions(campaign: Campaign, flight: str, nodes: tuple[str, str],
     segmented = bool(campaign.segments_of(flight, "-".join(nodes)))
     positions = place(tx, rx, history.time.values, hovers=segmented)
     history = history.isel(pulse=positions.good)
+    _check_number(history, campaign.history_files(flight, nodes[1])[0])
     at = history.time.values
     offset_s = rx.settings.path_offset_m.radar / SPEED_OF_LIGHT_M_S
     rotating = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
     axes: dict[str, Any] = {
         name: (("pulse", "axis", "body"), log.body_axes(at)) for name, log in rotating.items() if log
     }
-    reasons = {**history.attrs.get("dropped", {}), **positions.reasons}
+    recorded = history.attrs.get("pulses", {}).get("reasons", history.attrs.get("dropped", {}))
+    reasons = {**recorded, **positions.reasons}
     counts: dict[str, Any] = {"used": len(at), "dropped": sum(reasons.values()), "reasons": reasons}
     antennas = tx.antenna("radar_tx", at), rx.antenna("radar_rx", at)
     lasting_s = history.attrs.get("sweep_used_s", 0.0)

@@ -1,6 +1,7 @@
 """Captures of a pair: reading in blocks of pulses, saturation check, and resampling to the transmitter's clock."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,11 @@ class Saturation:
     crest factor, max|s|²/mean|s|². A weak capture has a lower peak and an unchanged crest factor; a strong tone has a
     lower crest factor and an unchanged peak. Captures are compared with the 90th percentile of all captures.
 
+    A stable tone, such as the direct path in a beat signal, reaches its crest again and again without clipping: next to
+    the crest A of a sine, its largest code occurs 1/(√2 - 1) = 2.4 times as often as the code below it; at the code of
+    a clipping converter, this ratio is tens to hundreds. With `contrast`, an extreme counts only if it occurs that many
+    times as often as the adjacent value of the same block.
+
     Examples
     --------
     >>> rng = np.random.default_rng(1)
@@ -153,7 +159,8 @@ class Saturation:
     {'radar': 0.0054}
     """
 
-    def __init__(self) -> None:
+    def __init__(self, contrast: float = 0.0) -> None:
+        self._contrast = contrast
         self._extremes: dict[str, list[_Extreme]] = {}
         self._samples: dict[str, int] = {}
         self._powers: dict[str, list[Floats]] = {}
@@ -163,7 +170,7 @@ class Saturation:
         """Count the samples of a block of captures, channel → (capture, sample, 2)."""
         for name, samples in iq.items():
             self._samples[name] = self._samples.get(name, 0) + samples.size
-            extremes = self._extremes.setdefault(name, [_Extreme(+1), _Extreme(-1)])
+            extremes = self._extremes.setdefault(name, [_Extreme(sign, self._contrast) for sign in (+1, -1)])
             highest, lowest = samples.max(axis=(1, 2)), samples.min(axis=(1, 2))
             for extreme, value in zip(extremes, (highest.max().item(), lowest.min().item()), strict=True):
                 extreme.count(samples, value)
@@ -176,21 +183,25 @@ class Saturation:
     @property
     def shares(self) -> dict[str, float]:
         """Share of each channel's samples that repeat its largest or smallest value."""
-        return {  # a single occurrence of an extreme is not a repetition
-            name: (sum(extreme.times for extreme in self._extremes[name]) - 2) / count
+        return {
+            name: (sum(extreme.repeats for extreme in self._extremes[name])) / count
             for name, count in self._samples.items()
         }
 
     @property
     def flags(self) -> Flags:
         """Flags of channels with a clipping converter, and of captures limited in front of the converter."""
-        clipped = {
+        limited = [self._limited(name, *np.concatenate(powers, axis=1)) for name, powers in self._powers.items()]
+        return Flags.merged(self.clipped, *limited)
+
+    @property
+    def clipped(self) -> dict[str, str]:
+        """Flags of channels with a clipping converter."""
+        return {
             f"saturated_{name}": f"{share:.2%} of the samples of channel {name} are at full scale, {self._where(name)}"
             for name, share in self.shares.items()
             if share > SATURATED_SHARE
         }
-        limited = [self._limited(name, *np.concatenate(powers, axis=1)) for name, powers in self._powers.items()]
-        return Flags.merged(clipped, *limited)
 
     def _where(self, channel: str) -> str:
         """Return the number of saturated captures, and their power relative to the others: high for interference."""
@@ -224,14 +235,74 @@ class Saturation:
 class _Extreme:
     """The largest or, with `sign` -1, the smallest value so far, and its number of occurrences."""
 
-    def __init__(self, sign: int) -> None:
+    def __init__(self, sign: int, contrast: float) -> None:
         self.sign, self.value, self.times = sign, -sign * np.inf, 0
+        self.contrast, self.adjacent = contrast, 0
+
+    @property
+    def repeats(self) -> int:
+        """Number of further occurrences: a single one is not a repetition; 0 if the adjacent value is too frequent."""
+        return self.times - 1 if self.times > self.contrast * self.adjacent else 0
 
     def count(self, samples: Samples, value: float) -> None:
         if self.sign * value < self.sign * self.value:
             return
-        earlier = self.times if value == self.value else 0
-        self.value, self.times = value, earlier + int(np.count_nonzero(samples == value))
+        if value != self.value:
+            self.value, self.times, self.adjacent = value, 0, 0
+        at_value = samples == value
+        self.times += int(np.count_nonzero(at_value))
+        others = samples[~at_value] if self.contrast else samples[:0]
+        if others.size:
+            self.adjacent += int(np.count_nonzero(others == (others.max() if self.sign > 0 else others.min())))
+
+
+# ---- Captures that repeat earlier ones
+
+HEAD = 16
+"""Samples of a capture compared first, so that few captures are read completely."""
+
+
+def repeated(heads: Iterable[NDArray[Any]], whole: Callable[[int], NDArray[Any]]) -> NDArray[np.bool_]:
+    """Find captures that are bit-identical to an earlier capture, which noise would prevent.
+
+    Parameters
+    ----------
+    heads
+        Some samples of each capture, in order; captures whose heads are unique are not read further.
+    whole
+        Function that returns all samples of a capture.
+
+    Returns
+    -------
+    ndarray
+        (capture,) bool.
+
+    Examples
+    --------
+    >>> captures = np.array([[1, 2, 3], [1, 2, 4], [5, 6, 7], [1, 2, 3]])
+    >>> repeated(captures[:, :2], lambda number: captures[number]).tolist()
+    [False, False, False, True]
+    """
+    count, candidates = 0, dict[bytes, list[int]]()
+    for head in heads:
+        candidates.setdefault(head.tobytes(), []).append(count)
+        count += 1
+    repeats = np.zeros(count, bool)
+    for numbers in candidates.values():
+        known = set[bytes]()
+        for number in numbers if len(numbers) > 1 else ():
+            digest = hashlib.blake2b(whole(number).tobytes(), digest_size=16).digest()
+            repeats[number] = digest in known
+            known.add(digest)
+    return repeats
+
+
+def repeat_flags(repeats: NDArray[np.bool_], node: str, *, first: int, remark: str = "") -> Flags:
+    """Return a flag if captures of a node repeat earlier ones; `first`: number of the first of them."""
+    if not repeats.any():
+        return Flags()
+    line = f"{int(repeats.sum())} of {len(repeats)} captures of {node}, first at capture {first}{remark}"
+    return Flags({"captures_repeated": line})
 
 
 # ---- Correction of clock offsets

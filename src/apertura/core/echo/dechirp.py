@@ -11,6 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.units import decibels
 
 Mixing = Literal["real", "complex", "conjugate"]
 
@@ -171,6 +172,65 @@ def transfer_of(
             spectrum = spectrum * np.exp(-2j * np.pi * late_s[sweeps, None] * beat_hz)
         transfer[sweeps] = scipy.fft.ifft(spectrum, axis=1)[:, :kept]
     return transfer if slope > 0 else np.ascontiguousarray(transfer[:, ::-1])
+
+
+_IDLE_PARTS = 64
+"""Parts of a sweep whose powers are compared."""
+
+_IDLE_BODY = 16
+"""First part that is compared: before it, echoes from far away are still missing."""
+
+_IDLE_LEAST = 2
+"""Smallest number of parts without echoes that are detected, in addition to a part with the end of the sweep."""
+
+_IDLE_SHARPNESS = 0.5
+"""Least difference between the lowest part of the sweep and the highest idle part, relative to that of the medians."""
+
+_IDLE_DROP = 0.1
+"""Least decrease of the power, relative to that of echoes and noise together."""
+
+
+class SweepPower:
+    """Power of the fluctuating part of beat signals along the sweep, block by block.
+
+    The mean over all sweeps is subtracted, i.e. echoes at constant range such as the direct path.
+    """
+
+    def __init__(self, sweep: FrequencySweep) -> None:
+        self._sweep, self._count = sweep, 0
+        self._sum, self._squares = np.zeros(sweep.samples, np.complex128), np.zeros(sweep.samples)
+
+    def count(self, beat: NDArray[np.number]) -> None:
+        """Add the used samples of sweeps, (sweep, sample)."""
+        self._count += len(beat)
+        self._sum += beat.sum(axis=0, dtype=np.complex128)
+        self._squares += (np.abs(beat).astype(np.float64) ** 2).sum(axis=0)
+
+    @property
+    def flags(self) -> dict[str, str]:
+        """Flag of sweeps that end before `sweep_s`, after which the rows contain noise only.
+
+        Notes
+        -----
+        Source: docs/theory/fmcw.md, "Idle time". A window that the recorder applied decreases towards both ends.
+        """
+        if self._sweep.samples < _IDLE_PARTS or not self._count:
+            return {}
+        power = (self._squares - np.abs(self._sum) ** 2 / self._count) / self._count
+        edges = np.linspace(0, len(power), _IDLE_PARTS + 1).astype(np.int64)
+        parts = np.add.reduceat(power, edges[:-1]) / np.diff(edges)
+        for end in range(_IDLE_PARTS // 2, _IDLE_PARTS - _IDLE_LEAST):
+            body, idle = parts[_IDLE_BODY:end], parts[end + 1 :]  # part `end` contains the end of the sweep
+            level, rest = float(np.median(body)), float(np.median(idle))
+            is_sharp = body.min() - idle.max() > _IDLE_SHARPNESS * (level - rest)
+            is_window = (parts[: len(idle)] < (level + rest) / 2).all()
+            if is_sharp and not is_window and level - rest > _IDLE_DROP * level:
+                last_s = (self._sweep.first + edges[end : end + 2].mean()) / self._sweep.sample_rate_hz
+                line = (
+                    f"the power of the samples decreases by {decibels(level / max(rest, 1e-9 * level)):.1f} dB after "
+                )
+                return {"sweep_idle": f"{line}{last_s:.3g} s; waveform.sweep_s is {self._sweep.sweep_s:.3g} s"}
+        return {}
 
 
 def sweep_motion_flags(

@@ -408,14 +408,22 @@ def _shown(
     return response.at(formation.positions_at(*pixel), formation.positions_at(*others.T))
 
 
+_NARROWEST = 1e-7
+"""Least variance of the spatial spectrum in any direction, relative to the trace; above the rounding of image.json."""
+
+
 def _spectrum(formation: Formation) -> NDArray[np.float64]:
-    """Return the covariance of the spatial spectrum of a point at the scene centre, east and north."""
+    """Return the covariance of the spatial spectrum of a point at the scene centre, east and north.
+
+    It is positive definite even without an aperture.
+    """
     profiles, grid = formation.profiles, formation.grid
     row, column = ((size - 1) / 2 for size in grid.shape)
     middle_m, axes = ground_axes(formation, row, column)
     half = profiles.bandwidth_hz / 2
     band = profiles.centre_frequency_hz + half * np.linspace(-1, 1, _BAND_SAMPLES) * _WINDOWED
-    return profiles.aperture.spectrum(middle_m, axes, frequency_hz=band, weigh=_coverage_of(formation))
+    spectrum = profiles.aperture.spectrum(middle_m, axes, frequency_hz=band, weigh=_coverage_of(formation))
+    return np.asarray(spectrum + _NARROWEST * np.trace(spectrum) * np.eye(2))
 
 
 def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
@@ -459,7 +467,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
         **({"elsewhere": elsewhere} if elsewhere else {}),
         **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
-        "spectrum_cycles2_m2": [[float(f"{value:.4g}") for value in row] for row in _spectrum(formation)],
+        "spectrum_cycles2_m2": [[float(f"{value:.9g}") for value in row] for row in _spectrum(formation)],
         "maxima": len(points),
         "parts": {name: round(value, 4) if np.isfinite(value) else None for name, value in asdict(parts).items()},
         "points": [

@@ -17,13 +17,14 @@ from apertura.common.errors import CampaignError, print_remark
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.phase_histories import mat_fields, phase_history
 from apertura.formats.phase_histories.mat_fields import CORRECTIONS
-from apertura.formats.phase_histories.phase_history import LARGEST, History, largest_by_row, refused
+from apertura.formats.phase_histories.phase_history import LARGEST, LEAST, History, largest_by_row, refused
 
 _EXPECTED = "a Gotcha .mat file with data.fp (frequency, pulse), freq, x, y, z, r0, all finite"
 
 _LARGEST = {"fp": LARGEST, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7, "r_correct": 1e4, "ph_correct": 1e4}
 """Largest accepted value of each field: samples, Hz, m, rad."""
 
+_LEAST = {"fp": LEAST}
 
 _EPOCH = np.datetime64("1970-01-01", "ns")
 
@@ -139,7 +140,7 @@ def _check(fields: dict[str, NDArray[Any]], path: Path) -> None:
             path,
         )
     for name, values in fields.items():
-        largest_by_row(name, values, _LARGEST[name], lambda found: _error(found, path))
+        largest_by_row(name, values, _LARGEST[name], lambda found: _error(found, path), least=_LEAST.get(name, 0.0))
     zero_pulses = np.flatnonzero(~fields["fp"].any(axis=0))
     if zero_pulses.size:
         raise _error(f"pulse {int(zero_pulses[0])} contains only zeros ({zero_pulses.size} such pulses)", path)

@@ -19,7 +19,7 @@ from apertura.core.geometry.geodesy import LOCAL
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.phase_histories import cphd_fields
 from apertura.formats.phase_histories.cphd_fields import PATH_LIMIT, PULSE_FIELDS
-from apertura.formats.phase_histories.phase_history import LARGEST, History, joined, largest_by_row, refused
+from apertura.formats.phase_histories.phase_history import LARGEST, LEAST, History, joined, largest_by_row, refused
 
 _EXPECTED = "a CPHD file, version 1.0.1 or 1.1.0, with uncompressed samples in the frequency domain (DomainType FX)"
 _FORMATS = {"CF8": ">c8", "CI4": ">i2", "CI2": "i1"}
@@ -120,7 +120,7 @@ def history(path: Path, fields: dict[str, NDArray[Any]], *, pair: str) -> Histor
         raise refuse("no pulse with SIGNAL 1")
     vectors = _Vectors(samples, fields, normal)
     _check_frequencies(vectors.frequency, fields, normal, path)
-    is_zero = normal & (largest_by_row("the signal", vectors, LARGEST, refuse) == 0)
+    is_zero = normal & (largest_by_row("the signal", vectors, LARGEST, refuse, least=LEAST) == 0)
     tx, rx, point = fields["TxPos"], fields["RcvPos"], fields["SRPPos"]
     path_m = np.linalg.norm(tx - point, axis=1) + np.linalg.norm(rx - point, axis=1)
     elapsed = np.where(normal, fields["TxTime"], 0.0)

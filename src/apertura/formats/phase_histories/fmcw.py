@@ -1,5 +1,6 @@
 """Beat signals of FMCW radars as arrays (.npy, .mat) or audio (.wav), read as stage `echo` without positions."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,10 +13,13 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.core.echo.dechirp import FrequencySweep, transfer_of
+from apertura.common.flags import Flags
+from apertura.core.echo.captures import Saturation, blocks_of
+from apertura.core.echo.dechirp import FrequencySweep, SweepPower, transfer_of
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.npy import read_npy
 from apertura.formats.phase_histories import fmcw_fields
+from apertura.formats.phase_histories.phase_history import LARGEST, LEAST, distinct
 from apertura.formats.times import utc_times
 
 # ---- Beat signals of FMCW radars as arrays (.npy, .mat) -------------------------------------------------------------
@@ -24,9 +28,6 @@ from apertura.formats.times import utc_times
 
 _TIMES = ".time.npy"
 _MOST_VALUES = 1 << 34
-_LARGEST = 1e15
-"""Largest accepted sample; its square is within the range of float32."""
-
 _FARTHEST_S = 2.0**33
 """Limit of times since 1970, s, within the range of int64 nanoseconds."""
 
@@ -41,6 +42,10 @@ The value is below 1, because float64 seconds since 1970 have a resolution of 0.
 
 _MOST_INTERVALS = 1.05
 """Maximum duration of a row of samples relative to the interval between sweeps."""
+
+_CLIPPED_CONTRAST = 4.0
+"""Frequency of the extreme value of a clipped beat signal relative to the adjacent value, at least; 2.4 at the crest of
+a stable tone."""
 
 _EXPECTED = "beat signals (sweep, sample), real or complex as configured in waveform.iq, all finite"
 _REMEDY = "Correct the file, or waveform in the config."
@@ -155,19 +160,29 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
         If sweeps are too short, contradict waveform.iq, or contain values that are not finite, or if times are missing
         or do not increase.
     """
-    sweep, dropped = sweep_of(described), dict[str, int]()
-    times, transfers = list[Times](), list[NDArray[np.complex64]]()
+    sweep, dropped = sweep_of(described), Counter[str]()
+    all_starts, echoes = list[Times](), list[NDArray[np.bool_]]()
     for file in read:
         _check(file, sweep, described)
         starts = _regular(file, described, is_single=len(read) == 1) if file.time is None else file.time
         if len(starts) != len(file.beat):
             raise _error(f"{len(starts)} times for {len(file.beat)} sweeps", file.path)
-        has_signal = file.beat[:, sweep.first : sweep.sweep_samples].any(axis=1)
-        excluded = {**(file.dropped or {}), "all samples zero": int((~has_signal).sum())}
-        dropped = {reason: dropped.get(reason, 0) + excluded.get(reason, 0) for reason in {**dropped, **excluded}}
-        late_s = None if file.late_s is None else file.late_s[has_signal]
-        times.append(starts[has_signal])
-        transfers.append(transfer_of(file.beat[has_signal], sweep, late_s=late_s))
+        all_starts.append(starts)
+        echoes.append(np.asarray(file.beat[:, sweep.first : sweep.sweep_samples].any(axis=1)))
+        dropped.update({**(file.dropped or {}), "all samples zero": int((~echoes[-1]).sum())})
+    used = [file.beat[:, sweep.first : sweep.sweep_samples] for file in read]
+    kept, flags, repeats = distinct(used, echoes, node=pair.rpartition("-")[2])
+    dropped.update(repeats)
+    times, transfers = list[Times](), list[NDArray[np.complex64]]()
+    saturation, power = Saturation(_CLIPPED_CONTRAST), SweepPower(sweep)
+    for file, starts, mask in zip(read, all_starts, kept, strict=True):
+        for block in blocks_of(np.flatnonzero(mask)):
+            samples = file.beat[block, sweep.first : sweep.sweep_samples]
+            saturation.count({"radar": _parts(samples)})
+            power.count(samples)
+        late_s = None if file.late_s is None else file.late_s[mask]
+        times.append(starts[mask])
+        transfers.append(transfer_of(file.beat[mask], sweep, late_s=late_s))
     time = np.concatenate(times) + np.timedelta64(round(sweep.middle_s * 1e9), "ns")
     if not len(time):
         raise _error("no sweep with a non-zero sample", read[0].path)
@@ -189,12 +204,17 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
         },
         attrs={
             "pair": pair,
-            "flags": {},
+            "flags": Flags.merged(flags, saturation.clipped, power.flags),
             "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
             "dropped": {reason: count for reason, count in dropped.items() if count},
             "sweep_used_s": sweep.samples / sweep.sample_rate_hz,
         },
     )
+
+
+def _parts(beat: NDArray[Any]) -> NDArray[Any]:
+    """Return the real part of beat signals and, if they are complex, the imaginary part: (sweep, sample, part)."""
+    return np.stack([beat.real, beat.imag], -1) if np.iscomplexobj(beat) else np.asarray(beat)[..., None]
 
 
 def _check(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> None:
@@ -210,14 +230,20 @@ def _check(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) ->
         raise _error(f"{beat.dtype} of shape {beat.shape}; a sweep has {sweep.sweep_samples} samples", file.path)
     if (beat.dtype.kind == "c") != (sweep.iq != "real"):
         raise _error(f"{beat.dtype} samples, but waveform.iq is {sweep.iq}", file.path)
+    if beat.dtype.kind == "c" and beat.real.any() and not beat.imag.any():
+        raise _error(f"the imaginary parts of all samples are zero, but waveform.iq is {sweep.iq}", file.path)
     with np.errstate(invalid="ignore"):
-        bad = np.flatnonzero(~(np.abs(beat).max(axis=1) < _LARGEST))
+        magnitude = np.abs(beat).max(axis=1)
+    bad = np.flatnonzero(~(magnitude < LARGEST))
     if bad.size:
         raise _error(
-            f"sweep {int(bad[0])} contains a sample that is not a number or exceeds {_LARGEST:g} ({bad.size} such "
+            f"sweep {int(bad[0])} contains a sample that is not a number or exceeds {LARGEST:g} ({bad.size} such "
             "sweeps)",
             file.path,
         )
+    if 0 < magnitude.max() < LEAST:
+        found = f"the largest sample is {magnitude.max():.3g}, at least {LEAST:g} is accepted"
+        raise CampaignError(found, file.path, _EXPECTED, "Multiply the samples by a constant.")
 
 
 def _is_by_columns(file: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> bool:

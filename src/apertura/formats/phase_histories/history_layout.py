@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.errors import quoted
-from apertura.formats.phase_histories.phase_history import LARGEST, History, largest_by_row, refused
+from apertura.formats.phase_histories.phase_history import LARGEST, LEAST, History, largest_by_row, refused
 
 EXPECTED = (
     "arrays transfer, frequency, time, tx_position, rx_position, reference_delay and attribute frame, as documented"
@@ -31,10 +31,12 @@ class Field(NamedTuple):
     largest: float
     """Largest magnitude."""
     optional: bool = False
+    least: float = 0.0
+    """Smallest accepted magnitude of the largest value."""
 
 
 LAYOUT: Mapping[str, Field] = {
-    "transfer": Field(("pulse", "subcarrier"), "c", LARGEST),
+    "transfer": Field(("pulse", "subcarrier"), "c", LARGEST, least=LEAST),
     "frequency": Field(("subcarrier",), "fiu", 1e12),
     "time": Field(("pulse",), "i", 9e18),
     "tx_position": Field(("pulse", "axis"), "fiu", 1e8, optional=True),
@@ -112,7 +114,7 @@ def history(path: Path, fields: Mapping[str, NDArray[Any]]) -> History:
             if sizes.setdefault(dim, size) != size:
                 raise refuse(f"{name} has length {size} along {dim}, other arrays {sizes[dim]}")
     maxima = {
-        name: largest_by_row(name, fields[name], field.largest, refuse)
+        name: largest_by_row(name, fields[name], field.largest, refuse, least=field.least)
         for name, field in present.items()
         if name != "path_limit"
     }

@@ -1,7 +1,7 @@
 """Phase histories of other radars: content required from any format, and concatenation of files to stage `echo`."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -14,12 +14,13 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.units import nanoseconds
+from apertura.core.echo.captures import HEAD, repeat_flags, repeated
 
 if TYPE_CHECKING:
     import xarray as xr
 
-LARGEST = 1e30
-"""Largest sample accepted."""
+LARGEST, LEAST = 1e15, 1e-12
+"""Limits of the largest sample: powers of samples and of noise 60 dB below are within the range of float32."""
 
 LOWEST_HZ = 1e6
 """Lowest frequency of an imaging radar, Hz; smaller numbers are in MHz or GHz."""
@@ -92,7 +93,7 @@ class History:
 
 
 def largest_by_row(
-    name: str, values: Samples, largest: float, refuse: Callable[[str], CampaignError]
+    name: str, values: Samples, largest: float, refuse: Callable[[str], CampaignError], *, least: float = 0.0
 ) -> NDArray[np.float64]:
     """Return the largest magnitude of each row of an array, read in blocks.
 
@@ -106,11 +107,13 @@ def largest_by_row(
         Largest accepted magnitude.
     refuse
         Function that returns the error to raise from a description of the fault.
+    least
+        Smallest accepted magnitude of the largest value, unless all values are zero.
 
     Raises
     ------
     CampaignError
-        If a value is not finite or exceeds `largest`.
+        If a value is not finite or exceeds `largest`, or the largest value is below `least`.
 
     Examples
     --------
@@ -128,6 +131,10 @@ def largest_by_row(
         maxima[first : first + step] = np.abs(block).reshape(len(block), -1).max(axis=1)
     if rows and maxima.max() > largest:
         raise refuse(f"{name} reaches {maxima.max():.3g}, at most {largest:g} is accepted")
+    if rows and 0 < maxima.max() < least:
+        raise refuse(
+            f"{name} reaches only {maxima.max():.3g}, at least {least:g} is accepted (multiply it by a constant)"
+        )
     return maxima
 
 
@@ -147,7 +154,8 @@ def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dat
     ------
     CampaignError
         If a file contains no pulse, an antenna position far from the Earth, frequencies that do not increase in equal
-        steps, or times that do not increase; or if its frequencies or frame differ from those of the first file.
+        steps, or times that do not increase; if its frequencies or frame differ from those of the first file; or if
+        the samples of all files have no imaginary part.
     """
     import dask.array as da
     import xarray as xr
@@ -159,9 +167,14 @@ def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dat
     for history in histories:
         _check(history, first, expected)
     _check_times(histories, expected)
+    _check_phase(histories)
+    node = pair.rpartition("-")[2]
+    kept, repeat_flag, repeats = distinct(
+        [history.transfer for history in histories], [history.used for history in histories], node=node
+    )
     parts = [
-        da.from_array(history.transfer, chunks=(_rows(history.transfer), -1), name=False, asarray=True)[history.used]
-        for history in histories
+        da.from_array(history.transfer, chunks=(_rows(history.transfer), -1), name=False, asarray=True)[used]
+        for history, used in zip(histories, kept, strict=True)
     ]
     positions = ("tx_position", "rx_position") if first.frame else ()
     dims = {
@@ -169,20 +182,77 @@ def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dat
         **dict.fromkeys(("time", "reference_delay", "path_limit"), "pulse"),
     }
     arrays = {
-        name: (dims[name], np.concatenate([getattr(history, name)[history.used] for history in histories]))
+        name: (
+            dims[name],
+            np.concatenate([getattr(history, name)[used] for history, used in zip(histories, kept, strict=True)]),
+        )
         for name in dims
     }
     attrs: dict[str, Any] = {"frame": first.frame} if first.frame else {}
     missing = missing_flags(nanoseconds(arrays["time"][1]))
-    flags = Flags.merged(missing, *(history.flags for history in histories))
+    flags = Flags.merged(missing, repeat_flag, *(history.flags for history in histories))
     attrs |= {"pair": pair, "flags": flags, "reference": first.reference, "wave_speed_m_s": SPEED_OF_LIGHT_M_S}
-    reasons = Counter[str]()
+    reasons = Counter[str](repeats)
     for history in histories:
         reasons.update(history.dropped)
     if reasons:
         attrs["pulses"] = {"used": len(arrays["time"][1]), "dropped": reasons.total(), "reasons": dict(reasons)}
     samples = ("pulse", "subcarrier"), da.concatenate(parts)
     return xr.Dataset({**arrays, "transfer": samples, "frequency": ("subcarrier", frequency)}, attrs=attrs)
+
+
+def distinct(
+    parts: Sequence[Samples], used: Sequence[NDArray[np.bool_]], *, node: str
+) -> tuple[list[NDArray[np.bool_]], Flags, dict[str, int]]:
+    """Exclude pulses that are bit-identical to earlier ones, in all files of a node.
+
+    Pulses that are all identical are not excluded: a simulated echo of the reference point without noise.
+
+    Parameters
+    ----------
+    parts
+        Samples of each file, (pulse, sample).
+    used
+        Masks of the pulses with echoes.
+    node
+        Receiving node.
+
+    Returns
+    -------
+    kept
+        Masks of the pulses that remain.
+    flags
+        Flag `captures_repeated`.
+    dropped
+        Number of excluded pulses by reason.
+    """
+    places = [(part, int(row)) for part, mask in zip(parts, used, strict=True) for row in np.flatnonzero(mask)]
+
+    def heads() -> Iterator[NDArray[Any]]:
+        for part, mask in zip(parts, used, strict=True):
+            middle, step = max(0, part.shape[1] - HEAD) // 2, _rows(part)
+            for first in range(0, len(mask), step):
+                block = np.asarray(part[first : first + step, middle : middle + HEAD])
+                yield from block[mask[first : first + step]]
+
+    def whole(number: int) -> NDArray[Any]:
+        part, row = places[number]
+        return np.asarray(part[row : row + 1])
+
+    repeats = repeated(heads(), whole)
+    if not repeats.any():
+        return list(used), Flags(), {}
+    identical = repeats.sum() == len(repeats) - 1
+    remark = "; not excluded, because all are identical" if identical else ""
+    flags = repeat_flags(repeats, node, first=int(repeats.argmax()), remark=remark)
+    if identical:
+        return list(used), flags, {}
+    kept, begin = [mask.copy() for mask in used], 0
+    for mask in kept:
+        end = begin + int(mask.sum())
+        mask[mask] = ~repeats[begin:end]
+        begin = end
+    return kept, flags, {"captures_repeated": int(repeats.sum())}
 
 
 def _rows(samples: Samples) -> int:
@@ -206,6 +276,25 @@ def _check(history: History, first: History, expected: str) -> None:
                 f"{name} of pulse {bad[0]} is {radius[bad[0]]:.0f} m from the Earth's centre ({bad.size} such pulses)"
             )
             raise refused(found, history.path, expected)
+
+
+def _check_phase(histories: Sequence[History]) -> None:
+    """Raise CampaignError if all samples are real and vary with frequency: each echo would appear at -τ as well."""
+    varies = False
+    for history in histories:
+        for first in range(0, len(history.used), _rows(history.transfer)):
+            block = np.asarray(history.transfer[first : first + _rows(history.transfer)])
+            if block.imag.any():
+                return
+            varies |= bool((block != block[:, :1]).any())
+    if varies:
+        raise CampaignError(
+            "the imaginary parts of all samples are zero",
+            histories[0].path,
+            "complex transfer functions",
+            "Save real and imaginary parts; from real samples, echoes before and behind the reference delay cannot be "
+            "distinguished.",
+        )
 
 
 def _check_times(histories: Sequence[History], expected: str) -> None:

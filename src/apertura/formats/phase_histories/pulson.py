@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from apertura.common.atomic import naming
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.formats.phase_histories.phase_history import distinct
 from apertura.formats.tracks.csv_track import LARGEST_LOG
 
 SAMPLE_RATE_HZ = 16.384e9
@@ -63,6 +64,8 @@ def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
     messages = np.concatenate([first for first, _, _ in scans])
     samples = np.concatenate([scan for _, scan, _ in scans])
     incomplete = sum(count for _, _, count in scans)
+    (kept,), flags, repeats = distinct([samples], [np.ones(len(samples), bool)], node=pair.rpartition("-")[2])
+    messages, samples = messages[kept], samples[kept]
     start_ps, total = int(messages["start_ps"][0]), int(messages["total"][0])
     time_ms = messages["time_ms"].astype(np.int64)
     backwards = np.flatnonzero(np.diff(time_ms) <= 0)
@@ -74,7 +77,8 @@ def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
     band = (frequency >= BAND_HZ[0]) & (frequency <= BAND_HZ[1])
     transfer = np.fft.rfft(samples, axis=1, norm="forward")[:, band].astype(np.complex64)
     duration_s = total / SAMPLE_RATE_HZ
-    flags = {"scans_incomplete": f"{incomplete} of {incomplete + len(samples)} scans"} if incomplete else {}
+    if incomplete:
+        flags["scans_incomplete"] = f"{incomplete} of {incomplete + len(kept)} scans"
     return xr.Dataset(
         {
             "time": ("pulse", _EPOCH + time_ms.astype("timedelta64[ms]").astype("timedelta64[ns]")),
@@ -83,7 +87,7 @@ def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
             "reference_delay": ("pulse", np.full(len(samples), start_ps * 1e-12)),
             "path_limit": ("pulse", np.full(len(samples), (start_ps * 1e-12 + duration_s) * SPEED_OF_LIGHT_M_S)),
         },
-        attrs={"pair": pair, "flags": flags, "wave_speed_m_s": SPEED_OF_LIGHT_M_S},
+        attrs={"pair": pair, "flags": flags, "dropped": repeats, "wave_speed_m_s": SPEED_OF_LIGHT_M_S},
     )
 
 

@@ -1,7 +1,6 @@
 """Recordings of any recorder: samples, captures with UTC time tags, and framing of the transmitted symbols."""
 
-import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,10 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import hashes_of_file
+from apertura.core.echo.captures import HEAD, repeated
 from apertura.formats.recordings.sample_file import SampleFile
 
 _AT_ONCE = 4096
-_FIRST = 16  # samples compared first, so that few captures are read completely to detect empty or repeated captures
 
 
 def _sha512(path: Path) -> str:
@@ -123,28 +122,21 @@ class Recording:
         )
 
     def _repeats(self, captures: Captures) -> NDArray[np.bool_]:
-        """Find captures that are bit-identical to an earlier capture, which noise would prevent; (capture,) bool.
+        """Return a mask of the captures that repeat an earlier one; raise CampaignError if a capture is all zeros."""
+        start, zero_blocks = captures.start, list[NDArray[np.bool_]]()
 
-        Captures whose first samples are unique are not read further.
+        def heads() -> Iterator[NDArray[Any]]:
+            for first in range(0, len(start), _AT_ONCE):
+                block = start[first : first + _AT_ONCE]
+                samples = self.samples.captures(block, min(HEAD, captures.length))
+                is_zero = np.asarray(~samples.any(axis=(1, 3)))
+                for capture in np.flatnonzero(is_zero.any(axis=1)):
+                    whole = self.samples.captures(block[capture : capture + 1], captures.length)
+                    is_zero[capture] = ~whole.any(axis=(0, 1, 3))
+                zero_blocks.append(is_zero)
+                yield from samples
 
-        Raises
-        ------
-        CampaignError
-            If a capture contains only zeros.
-        """
-        start, head = captures.start, min(_FIRST, captures.length)
-        zero_blocks, candidates = list[NDArray[np.bool_]](), dict[bytes, list[int]]()
-        for first in range(0, len(start), _AT_ONCE):
-            block = start[first : first + _AT_ONCE]
-            heads = self.samples.captures(block, head)
-            for number, samples in enumerate(heads, first):
-                candidates.setdefault(samples.tobytes(), []).append(number)
-            is_zero = np.asarray(~heads.any(axis=(1, 3)))
-            for capture in np.flatnonzero(is_zero.any(axis=1)):
-                is_zero[capture] = ~self.samples.captures(block[capture : capture + 1], captures.length).any(
-                    axis=(0, 1, 3)
-                )
-            zero_blocks.append(is_zero)
+        repeats = repeated(heads(), lambda number: self.samples.captures(start[number : number + 1], captures.length))
         for name, is_zero in zip(self.channels, np.concatenate(zero_blocks).T, strict=True):
             if is_zero.any():
                 raise CampaignError(
@@ -154,12 +146,4 @@ class Recording:
                     "non-zero samples",
                     "The receiver or the copy failed; record or copy again, or remove those captures.",
                 )
-        repeats = np.zeros(len(start), bool)
-        for numbers in candidates.values():
-            known = set[bytes]()
-            for number in numbers if len(numbers) > 1 else ():
-                content = self.samples.captures(start[number : number + 1], captures.length).tobytes()
-                digest = hashlib.blake2b(content, digest_size=16).digest()
-                repeats[number] = digest in known
-                known.add(digest)
         return repeats
