@@ -529,6 +529,13 @@ _OF_IMAGES = {
         "nodes.<n>.position_std_m, scene.height_std_m and time_tag_std_s, which may be too optimistic",
         "core/imaging/focus_check.py",
     ),
+    "range_defocused": Flag(
+        "peak loss of bright points by phase errors over frequency, dB, with standard deviation; quadratic phase, rad",
+        "phase errors over frequency reduced the peaks of bright points by more than 1 dB and smear points in range",
+        "the waveform in the configuration: chirp rate, pulse file, sweep and bandwidth; nonlinearity of the sweep; "
+        "filters",
+        "core/imaging/focus_check.py",
+    ),
     "echo_outside_scene": Flag(
         "position of the strong echo",
         "the pulses contain a strong echo at ranges outside the scene, or a strong echo that does not focus at any "
