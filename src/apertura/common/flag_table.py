@@ -205,6 +205,14 @@ _OF_RECORDINGS = {
         "gain; if a few captures have a much higher power than the others: interference",
         "core/echo/captures.py",
     ),
+    "gain_step": Flag(
+        "change of the power, dB; number and time of the pulse; number of steps",
+        "the power of the pulses changes within one pulse interval and does not return: the gain changed, and levels "
+        "of the image are wrong",
+        "gain control of the recorder and of the transmitter; several recordings in one file; persistent interference; "
+        "blockage of the sidelink",
+        "core/echo/gain_step.py",
+    ),
     "code_unconfirmed": Flag(
         "strongest echo relative to the level beyond the prefix, dB; or share of signals that are not compressed",
         "the code compresses no echo within the prefix or listening time, although the captures contain signals",

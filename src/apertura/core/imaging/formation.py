@@ -209,7 +209,7 @@ class Formation:
             history = self.history[pulses]
             transfer, frequency_hz = np.asarray(history.transfer), history.frequency_hz
             delay_s = history.aperture.path(points_m) / history.wave_speed_m_s - history.reference_delay_s[:, None]
-            weights = self.beams and self.beams[pulses].weight(history.aperture, points_m)
+            weights = None if self.beams is None else self.beams[pulses].weight(history.aperture, points_m)
             for point, of_point in enumerate(delay_s.T):
                 terms = remove_path(transfer, frequency_hz, delay_s=of_point)
                 total[point] += terms.sum(axis=0) if weights is None else weights[:, point] @ terms

@@ -338,7 +338,7 @@ def band_focus(spectrum: NDArray[np.complex128], weight: NDArray[np.float64]) ->
     >>> x = np.linspace(-1, 1, 256)
     >>> focus = band_focus(np.exp(3j * x**2), np.hanning(256))
     >>> round(focus.loss_db, 1), round(focus.phase_rad, 1)
-    (-0.7, 3.0)
+    (-0.9, 3.0)
     >>> band_focus(1 + 0.9 * np.exp(10j * x), np.hanning(256)) is None
     True
     """
