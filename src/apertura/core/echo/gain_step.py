@@ -1,7 +1,6 @@
 """Persistent steps of the power of pulses by changes of the gain: docs/theory/recordings.md, eq. 10."""
 
 import numpy as np
-import scipy
 
 from apertura.common.arrays import Floats
 from apertura.common.errors import number_of
@@ -42,7 +41,7 @@ def gain_step_flags(power: Floats, time_s: Floats) -> Flags:
         return Flags()
     level_db, interval_s = 10 * np.log10(power[numbers]), np.diff(time_s[numbers])
     change_db = np.diff(level_db)
-    fluctuation_db = float(scipy.stats.median_abs_deviation(change_db, scale="normal"))
+    fluctuation_db = 1.4826 * float(np.median(np.abs(change_db - np.median(change_db))))
     limit_db = max(LEAST_STEP_DB, _SIGMAS * fluctuation_db)
     adjacent = interval_s < _GAP * np.median(interval_s)
     steps = dict[int, float]()
