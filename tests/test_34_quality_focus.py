@@ -30,6 +30,7 @@ from apertura.core.quality.budget import (
 from apertura.core.quality.focus import (
     GEOMETRY_CONTRADICTED,
     PointFocus,
+    band_focus,
     compare_parts,
     focus_with_flags,
     judge,
@@ -283,6 +284,74 @@ def test_points_with_unequal_focus_are_flagged(changed):
     if changed == "one target moves":
         assert "1 of 5 bright points" in flags["focus_uneven"]
         assert "at (-8." in flags["focus_uneven"]
+
+
+# Focus in range
+
+BAND = np.linspace(-1, 1, 256)
+HANN = np.hanning(258)[1:-1]
+
+
+def at_its_peak(spectrum):
+    """Remove the delay of the brightest peak, at which an image is evaluated."""
+    response = np.fft.fft(spectrum * HANN, 32 * len(spectrum))
+    return spectrum * np.exp(-2j * np.pi * np.abs(response).argmax() / len(response) * np.arange(len(spectrum)))
+
+
+@pytest.mark.parametrize(("rate_error", "verdict"), [(0.0, "focused"), (0.015, "focused"), (-0.025, "defocused")])
+def test_loss_by_a_wrong_chirp_rate_follows_from_its_quadratic_phase(rate_error, verdict):
+    """The time-bandwidth product is 200, as for 200 MHz in 1 µs; the SNR per subcarrier is 20 dB."""
+    phase_rad = np.pi * 200 * rate_error / 4
+    noise = 0.1 * complex_noise(np.random.default_rng(1), 256)
+    focus = band_focus(at_its_peak(np.exp(1j * phase_rad * BAND**2) + noise), HANN)
+    assert focus.phase_rad == pytest.approx(phase_rad, abs=0.1)
+    assert focus.loss_db == pytest.approx(-0.104 * phase_rad**2, abs=0.12)
+    assert judge([(1.0, focus)]).verdict == verdict
+
+
+@pytest.mark.parametrize(("phase_rad", "verdict"), [(2.0, "focused"), (9.0, "defocused")])
+def test_cubic_phase_over_frequency_is_measured(phase_rad, verdict):
+    spectrum = at_its_peak(np.exp(1j * phase_rad * BAND**3))
+    true_db = 20 * np.log10(np.abs(np.fft.fft(spectrum * HANN, 8192)).max() / HANN.sum())
+    focus = band_focus(spectrum, HANN)
+    assert focus.loss_db == pytest.approx(true_db, abs=0.1)
+    assert judge([(1.0, focus)]).verdict == verdict
+
+
+def range_defocused(generator, spectrum_of, scenes):
+    measured = [band_focus(at_its_peak(spectrum_of(generator)), HANN) for _ in range(scenes)]
+    return sum(judge([(1.0, focus)]).verdict == "defocused" for focus in measured)
+
+
+def two_points(generator):
+    phase = generator.uniform(0, 2 * np.pi) + np.pi * generator.uniform(0.3, 8) * BAND
+    return 1 + generator.uniform(0.2, 1) * np.exp(1j * phase)
+
+
+def extended_target(generator):
+    delays = generator.uniform(-0.5, 0.5, 40) * generator.uniform(1, 6)
+    return complex_noise(generator, 40) @ np.exp(1j * np.pi * np.outer(delays, BAND))
+
+
+@pytest.mark.parametrize(("spectrum_of", "most"), [(two_points, 0), (extended_target, 3)])
+def test_neighbours_in_range_and_extended_targets_are_not_range_defocus(spectrum_of, most):
+    """Neighbours change the amplitudes of a spectrum, phase errors do not."""
+    assert range_defocused(np.random.default_rng(5), spectrum_of, 200) <= most
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5, 2.0])
+def test_noise_is_not_range_defocus(noise):
+    assert not range_defocused(np.random.default_rng(6), lambda rng: 1 + noise * complex_noise(rng, 256), 200)
+    assert not range_defocused(np.random.default_rng(7), lambda rng: complex_noise(rng, 256), 50)
+
+
+def test_range_defocus_is_flagged_unless_phases_along_the_track_explain_the_loss():
+    measured = {"verdict": "defocused", "loss_db": -1.5, "std_db": 0.1, "phase_rad": 3.9, "points": 2}
+    report = {"verdict": "focused", "reason": "points lost", "loss_db": -0.02, "std_db": 0.02, "range": measured}
+    line = focus_flags(report, Effect(0, 0, 0, 0))["range_defocused"]
+    assert line.startswith("peak loss 1.5 ± 0.1 dB from phase errors over frequency, 2 bright points; quadratic phase")
+    assert "range_defocused" not in focus_flags(report | {"verdict": "defocused"}, Effect(0, 0, 0, 0))
+    assert not focus_flags(report | {"range": measured | {"verdict": "focused"}}, Effect(0, 0, 0, 0))
 
 
 def test_unconfigured_terms_are_not_summed_and_do_not_set_the_accuracy():

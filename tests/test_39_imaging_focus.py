@@ -1,5 +1,7 @@
 """Focus check of an image: origin of the echo, subaperture images, bright points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from apertura.core.imaging.focus_check import (
     PART_PX,
     PARTS,
     echo_outside_scene,
+    focus_flags,
     focus_report,
     joint_peak_power,
     part_images,
@@ -19,6 +22,7 @@ from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.planning.planner import make_plan
+from apertura.core.quality.path_errors import Effect
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GroundModels
 
@@ -124,6 +128,26 @@ ALONG = np.linspace(-1, 1, 512)
 LOGGED = np.stack([25 * ALONG, np.full(512, -60.0), np.full(512, 30.0)], -1)
 
 
+def reported(history, grid, ground):
+    """Return the focus report of the image of a phase history."""
+    models = GroundModels.of(ground, None, grid)
+    job = imaging_job(history.aperture, history.frequency_hz, history.weight, grid, models)
+    plan = make_plan(job, accuracy_db=-50.0)
+    formation = Formation(history, range_compress(history, grid, ground), grid, plan, 256)
+    return focus_report(formation, formation.image.compute())
+
+
+@pytest.mark.parametrize(("phase_rad", "verdict"), [(0.0, "focused"), (6.0, "defocused")])
+def test_image_with_a_phase_error_over_frequency_is_flagged(phase_rad, verdict):
+    """Two points, one of which has a neighbour in the next range cell; a quadratic phase smears all of them."""
+    history = echo_of(np.array([[-1.5, -1.0, 0.0], [-1.5, -0.4, 0.0], [1.5, 1.0, 0.0], [0.5, -2.0, 0.0]]))
+    error = np.exp(1j * phase_rad * np.linspace(-1, 1, 256) ** 2)
+    report = reported(replace(history, transfer=(history.transfer * error).astype(np.complex64)), GRID, GROUND)
+    assert report["range"]["verdict"] == verdict
+    assert report["range"]["phase_rad"] == pytest.approx(phase_rad, abs=0.5)
+    assert ("range_defocused" in focus_flags(report, Effect(0, 0, 0, 0))) == (verdict == "defocused")
+
+
 def coarse_report(targets, *, seed, bow_m=0.0):
     """Return focus report, point positions and true aperture; the track differs from the log by a bow."""
     generator = np.random.default_rng(seed)
@@ -136,11 +160,7 @@ def coarse_report(targets, *, seed, bow_m=0.0):
     window = np.hanning(258)[1:-1]
     history = PhaseHistory(echo, COARSE_HZ, window / window.sum(), np.zeros(512), Aperture(LOGGED, LOGGED))
     grid, ground = SceneGrid("local", -20.0, 20.0, 0.08, (500, 500)), FlatGround(0.0)
-    models = GroundModels.of(ground, None, grid)
-    job = imaging_job(history.aperture, COARSE_HZ, history.weight, grid, models)
-    plan = make_plan(job, accuracy_db=-50.0)
-    formation = Formation(history, range_compress(history, grid, ground), grid, plan, 256)
-    return focus_report(formation, formation.image.compute()), points, aperture
+    return reported(history, grid, ground), points, aperture
 
 
 @pytest.mark.slow

@@ -60,6 +60,20 @@ def error_and_magnitudes(root, flight, pair="uav1-uav1"):
     return np.abs(measured[:, :2] - np.array(flight.targets)[:, :2]).max(), measured[:, 2]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("gain", "flagged"), [(1.2, False), (4.0, True)])
+def test_gain_step_during_a_flight_is_flagged(tmp_path, gain, flagged):
+    root = write_campaign(tmp_path)
+    file = root / "raw/f01/uav1.npy"
+    beats = np.load(file)
+    beats[120:] *= gain
+    np.save(file, beats)
+    process(root, last="image")
+    flags = image_of(root).attrs["flags"]
+    assert ("gain_step" in flags) == flagged
+    assert not flagged or flags["gain_step"].startswith("power +12.0 dB from pulse 121 of 200 on, 1.200 s after")
+
+
 @pytest.mark.quick("complex")
 @pytest.mark.parametrize(
     "sweep",

@@ -115,6 +115,21 @@ def test_echo_reports_its_filter(imaged):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("rate_error", "flagged"), [(0.0, False), (0.02, True)])
+def test_pulse_file_with_another_chirp_rate_is_flagged(tmp_path, rate_error, flagged):
+    """The chirp has a time-bandwidth product of 410: an error of 2 % has 6.4 rad at the edges of the band."""
+    root = simulate(tmp_path / "campaign", preset("demo", pulses=150), waveform=PULSES["chirp"], targets=TARGETS)
+    file = root / "raw/pulse.npy"
+    pulse = np.load(file)
+    time_s = (np.arange(len(pulse)) - (len(pulse) - 1) / 2) / 1.024e9
+    np.save(file, (pulse * np.exp(1j * np.pi * rate_error * 409.6e12 * time_s**2)).astype(np.complex64))
+    image = process(root, last="image").stage("image", "f01", "uav1-uav1")
+    attrs = open_stage(image, "image").attrs["quality"]
+    assert ("range_defocused" in attrs["flags"]) == flagged
+    assert (attrs["focus"]["verdict"] == "focused") != flagged
+
+
+@pytest.mark.slow
 def test_planned_pair_agrees_with_the_formed_echo(tiny):
     campaign = Campaign.load(tiny)
     planned = [open_pair(campaign, "f01", pair) for pair in PAIRS]

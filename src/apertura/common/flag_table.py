@@ -212,6 +212,14 @@ _OF_RECORDINGS = {
         "gain; if a few captures have a much higher power than the others: interference",
         "core/echo/captures.py",
     ),
+    "gain_step": Flag(
+        "change of the power, dB; number and time of the pulse; number of steps",
+        "the power of the pulses changes within one pulse interval and does not return: the gain changed, and levels "
+        "of the image are wrong",
+        "gain control of the recorder and of the transmitter; several recordings in one file; persistent interference; "
+        "blockage of the sidelink",
+        "core/echo/gain_step.py",
+    ),
     "code_unconfirmed": Flag(
         "strongest echo relative to the level beyond the prefix, dB; or share of signals that are not compressed",
         "the code compresses no echo within the prefix or listening time, although the captures contain signals",
@@ -541,6 +549,13 @@ _OF_IMAGES = {
         "single bright points are defocused although most are focused: they moved, or the geometry is wrong by amounts "
         "that depend on the position, such as heights, reference point, carrier, or the sign of the phase",
         "heights of these points, scene.dem; sign convention of a phase history; carrier; moving objects",
+        "core/imaging/focus_check.py",
+    ),
+    "range_defocused": Flag(
+        "peak loss of bright points by phase errors over frequency, dB, with standard deviation; quadratic phase, rad",
+        "phase errors over frequency reduced the peaks of bright points by more than 1 dB and smear points in range",
+        "the waveform in the configuration: chirp rate, pulse file, sweep and bandwidth; nonlinearity of the sweep; "
+        "filters",
         "core/imaging/focus_check.py",
     ),
     "echo_outside_scene": Flag(

@@ -18,6 +18,7 @@ from apertura.core.echo.background import Background, GroupMeans, background_exc
 from apertura.core.echo.captures import runs, sampled_pulses
 from apertura.core.echo.compression import centre_frequency, window_weights
 from apertura.core.echo.demodulate import remove_path
+from apertura.core.echo.gain_step import gain_step_flags
 from apertura.core.echo.interference import Interference, NoisyPulses, PulsedInterference
 from apertura.core.imaging.background import BackgroundScene, Removal, decide_removal
 from apertura.core.imaging.range_profiles import CompressionError, RangeWindow, phase_history_of, range_compress
@@ -53,9 +54,12 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     with writing(folder) as wip:
         noisy = NoisyPulses()
         error_db = write(wip, echo, noisy)
+        power = noisy.power
         if cleaning.interference is None:
             noisy = NoisyPulses()
-        flags = Flags.merged(echo.flags, cleaning.flags, noisy.flags)  # before samples are read again
+        kept = np.where(noisy.excluded, 0.0, power) if noisy.excluded.any() else power
+        steps = gain_step_flags(kept, echo.time_s)
+        flags = Flags.merged(echo.flags, steps, cleaning.flags, noisy.flags)  # before samples are read again
         if noisy.excluded.any():
             error_db = write(wip, echo.select(~noisy.excluded), NoisyPulses())
         attributes: dict[str, Any] = {

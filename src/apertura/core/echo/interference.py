@@ -470,6 +470,11 @@ class NoisyPulses:
         self._floor.append(np.zeros(pulses))
         self._power.append(np.zeros(pulses))
 
+    @property
+    def power(self) -> Floats:
+        """(pulse,) float64, mean power of the transfer functions; 0 for pulses that do not contribute to the scene."""
+        return np.concatenate(self._power)
+
     @cached_property
     def _relative(self) -> Floats:
         """(pulse,) float64, noise relative to that of the neighbouring pulses, by differences (eq. 6)."""
@@ -479,7 +484,7 @@ class NoisyPulses:
     def excess(self) -> Floats:
         """(pulse,) float64, noise relative to the usual noise: the lower of both tests; 0 where echoes dominate."""
         excess = np.minimum(self._relative, _over_neighbours(np.concatenate(self._floor), 0.5))
-        power = np.concatenate(self._power)
+        power = self.power
         share = np.divide(np.concatenate(self._noise), power, out=np.zeros_like(power), where=power > 0)
         usual = float(np.median(share[power > 0])) if (power > 0).any() else 0.0
         return np.where(share > min(_NOISE_SHARE, _NOISY * usual), excess, 0.0)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
@@ -22,8 +23,17 @@ from apertura.core.imaging.formation import PULSES_READ, Formation
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, RangeWindow, range_compress
 from apertura.core.imaging.view import ground_axes
 from apertura.core.quality.bright_points import SPECKLE, BrightPoint, PointResponse, bright_points
-from apertura.core.quality.focus import Focus, PointFocus, SubApertures, compare_parts, judge, judge_parts, point_focus
-from apertura.core.quality.measures import coherence_factor
+from apertura.core.quality.focus import (
+    Focus,
+    PointFocus,
+    SubApertures,
+    band_focus,
+    compare_parts,
+    judge,
+    judge_parts,
+    point_focus,
+)
+from apertura.core.quality.measures import coherence_factor, weighted_median
 from apertura.core.quality.path_errors import Effect
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
@@ -468,6 +478,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
         **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
         "spectrum_cycles2_m2": [[float(f"{value:.9g}") for value in row] for row in _spectrum(formation)],
+        **_range_report(formation, points),
         "maxima": len(points),
         "parts": {name: round(value, 4) if np.isfinite(value) else None for name, value in asdict(parts).items()},
         "points": [
@@ -502,6 +513,28 @@ def _uneven(
         f"{len(worse)} of {len(pairs)} bright points lose at least {-max(loss for loss, _ in worse):.1f} dB, median "
         f"{abs(verdict.loss_db):.1f} dB; most at ({x_m:.1f}, {y_m:.1f}): {-loss_db:.1f} dB"
     )
+
+
+_BAND_POINTS = 4  # number of points whose spectra are evaluated, the brightest
+
+
+def _range_report(formation: Formation, points: Sequence[BrightPoint]) -> dict[str, Any]:
+    """Measure the focus of the brightest points in range; {} if less than half of them dominate their surroundings."""
+    history, points = formation.history, points[:_BAND_POINTS]
+    if history is None or not points:
+        return {}
+    spectra = formation.spectra([point.row for point in points], [point.column for point in points])
+    found = [band_focus(spectrum, history.weight) for spectrum in spectra]
+    measured = [(point.amplitude, focus) for point, focus in zip(points, found, strict=True) if focus is not None]
+    if 2 * len(measured) < len(points):
+        return {}
+    verdict = judge(measured)
+    phase_rad = weighted_median(
+        np.array([focus.phase_rad for _, focus in measured]), np.array([amplitude for amplitude, _ in measured])
+    )
+    numbers = {"loss_db": verdict.loss_db, "std_db": verdict.std_db, "phase_rad": phase_rad}
+    rounded = {name: round(value, 3) for name, value in numbers.items()}
+    return {"range": {"verdict": verdict.verdict, **rounded, "points": verdict.points}}
 
 
 _CONJUGATED_LOSS_DB = -6.0  # loss beyond which the samples of a defocused image are tested for conjugation
@@ -542,7 +575,7 @@ points."""
 
 
 def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
-    """Evaluate the flags `defocused`, `loss_unexpected`, `focus_uneven` and `echo_outside_scene`.
+    """Evaluate the flags `defocused`, `loss_unexpected`, `focus_uneven`, `range_defocused` and `echo_outside_scene`.
 
     Parameters
     ----------
@@ -571,6 +604,13 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
             flags["loss_unexpected"] = (
                 f"{report['reason']}; {budget}: an error source exceeds the value in the error budget"
             )
+    in_range = report.get("range", {})
+    if in_range.get("verdict") == "defocused" and report["verdict"] != "defocused":
+        flags["range_defocused"] = (
+            f"peak loss {abs(in_range['loss_db']):.1f} ± {in_range['std_db']:.1f} dB from phase errors over frequency, "
+            f"{number_of(in_range['points'], 'bright point')}; quadratic phase {in_range['phase_rad']:+.1f} rad at the "
+            "edges of the band: the transmitted waveform differs from the configured one, or the radar is dispersive"
+        )
     if "conjugated" in report:
         return Flags({name: f"{line}; {report['conjugated']}" for name, line in flags.items()})
     return flags

@@ -19,6 +19,8 @@ from apertura.core.backprojection.engines.engine import Setting
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.backprojection.reach import PULSES, Reach, pulse_blocks_of
 from apertura.core.backprojection.tiles import Weighing, image_array
+from apertura.core.echo.captures import spread
+from apertura.core.echo.demodulate import remove_path
 from apertura.core.planning.plan import Plan
 from apertura.core.scene.grid import SceneGrid
 
@@ -191,6 +193,27 @@ class Formation:
                 for point, of_point in zip(np.flatnonzero(inside), terms.T, strict=True):
                     terms_of[point].append(of_point[of_point != 0])
         return [np.concatenate(terms) for terms in terms_of]
+
+    def spectra(self, row: ArrayLike, column: ArrayLike) -> NDArray[np.complex128]:
+        """Return the spectrum of the image at each fractional pixel, (point, subcarrier) complex128, without window.
+
+        It is the sum of the transfer functions without the phase of the path over a sample of up to 4096 pulses. The
+        result contains no points if only profiles are available. Source: docs/theory/focus.md, "Focus in range".
+        """
+        points_m = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
+        if self.history is None:
+            return np.zeros((0, 0), np.complex128)
+        total = np.zeros((len(points_m), len(self.history.frequency_hz)), np.complex128)
+        for group in spread(len(self.history), groups=64, each=64):
+            pulses = slice(int(group[0]), int(group[-1]) + 1)
+            history = self.history[pulses]
+            transfer, frequency_hz = np.asarray(history.transfer), history.frequency_hz
+            delay_s = history.aperture.path(points_m) / history.wave_speed_m_s - history.reference_delay_s[:, None]
+            weights = None if self.beams is None else self.beams[pulses].weight(history.aperture, points_m)
+            for point, of_point in enumerate(delay_s.T):
+                terms = remove_path(transfer, frequency_hz, delay_s=of_point)
+                total[point] += terms.sum(axis=0) if weights is None else weights[:, point] @ terms
+        return total
 
     def illuminating_pulses(
         self, points_m: NDArray[np.float64]

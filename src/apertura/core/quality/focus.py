@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,6 +157,7 @@ GEOMETRY_CONTRADICTED = frozenset(
         "phase_unobservable",
         "platform_below_scene",
         "position_error_understated",
+        "range_defocused",
         "reference_point",
         "refinement_rejected",
         "time_tag_offset",
@@ -227,33 +228,55 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
     >>> point_focus(noise[0] + 1j * noise[1]) is None
     True
     """
-    pulses = 1
-    # Blocks of 1, 2, 4 … pulses, until v of eq. 1 is small enough for a dominant point.
-    while len(contributions) // pulses >= LEAST_BLOCKS:
-        count = len(contributions) // pulses
-        blocks = contributions[: count * pulses].reshape(count, pulses).mean(axis=1)
+    found = _peak_loss(contributions, np.ones(len(contributions)), degree=_TREND, most=MOST_INTERFERENCE)
+    if found is None:
+        return None
+    snr_db = _snr_db(contributions)
+    allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))
+    coherence = coherence_factor(contributions)
+    return PointFocus(found.loss_db, found.variance, found.size, snr_db, coherence, allowed)
+
+
+class _PeakLoss(NamedTuple):
+    """Peak loss of terms by their phases: loss, v of eq. 1, terms per block, and the blocks without linear phase."""
+
+    loss_db: float
+    variance: float
+    size: int
+    blocks: NDArray[np.complex128]
+
+
+def _peak_loss(
+    terms: NDArray[np.complex128], weight: NDArray[np.float64], *, degree: int, most: float
+) -> _PeakLoss | None:
+    """Compute eq. 1 (over pulses) or 1d (over frequency) for terms of a point; None if it does not dominate them."""
+    size = 1
+    # Blocks of 1, 2, 4 … terms, until v of eq. 1 is small enough for a dominant point.
+    while len(terms) // size >= LEAST_BLOCKS:
+        count = len(terms) // size
+        blocks, weights = (values[: count * size].reshape(count, size).mean(axis=1) for values in (terms, weight))
         amplitude = np.abs(blocks)
         if amplitude.min() > 0:
-            variance = log_amplitude_variance(np.log(amplitude))
-            if variance <= MOST_INTERFERENCE:
-                best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
-                if abs(complex(blocks.sum())) < LEAST_PEAK_SHARE * best:
+            variance = log_amplitude_variance(np.log(amplitude), degree)
+            if variance <= most:
+                spectrum = np.fft.fft(blocks * weights, _PADDING * count)
+                best = int(np.abs(spectrum).argmax())
+                peak = float(np.abs(spectrum[best]))
+                if np.abs(spectrum[0]) < LEAST_PEAK_SHARE * peak:
                     return None
-                # Eq. 1: maximum of the spectrum over f, with the loss from noise and neighbours (v) removed.
-                loss = (best / amplitude.sum()) ** 2 * (1 + variance * (1 - 2.5 * variance) / 2) ** 2
-                snr_db = _snr_db(contributions)
-                allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))
-                loss_db = decibels(min(1.0, loss))
-                return PointFocus(loss_db, variance, pulses, snr_db, coherence_factor(contributions), allowed)
-        pulses *= 2
+                # Eq. 1 and 1d: maximum over f or over the delay, with the loss from noise and neighbours (v) removed.
+                loss = (peak / (amplitude * weights).sum()) ** 2 * (1 + variance * (1 - 2.5 * variance) / 2) ** 2
+                turned = blocks * np.exp(-2j * np.pi * best * np.arange(count) / len(spectrum))
+                return _PeakLoss(decibels(min(1.0, loss)), variance, size, turned)
+        size *= 2
     return None
 
 
-def log_amplitude_variance(log_amplitude: NDArray[np.float64]) -> float:
+def log_amplitude_variance(log_amplitude: NDArray[np.float64], degree: int = _TREND) -> float:
     """Return the log-amplitude variance of blocks about a smooth trend, which models patterns, range and aspect."""
     along = np.linspace(-1, 1, len(log_amplitude))
-    trend = np.polynomial.legendre.Legendre.fit(along, log_amplitude, _TREND)(along)
-    return float(((log_amplitude - trend) ** 2).sum() / (len(along) - _TREND - 1))
+    trend = np.polynomial.legendre.Legendre.fit(along, log_amplitude, degree)(along)
+    return float(((log_amplitude - trend) ** 2).sum() / (len(along) - degree - 1))
 
 
 def _snr_db(contributions: NDArray[np.complex128]) -> float:
@@ -267,6 +290,75 @@ def _snr_db(contributions: NDArray[np.complex128]) -> float:
     if not power:
         return float("-inf")
     return decibels(max(power - noise, 1e-3 * power) / max(noise, 1e-15 * power))
+
+
+# ---- Focus of bright points in range, from their spectra
+
+_BAND_TREND = 2  # degree of the polynomial that models antennas and filters in the log-amplitude over frequency
+
+_BAND_INTERFERENCE = 0.04
+"""Log-amplitude variance of a point over frequency, above which neighbours in range may cause its phases: a phase error
+does not change the amplitude."""
+
+_LEAST_WEIGHT = 0.01  # weight of the window relative to its maximum, below which subcarriers are not evaluated
+
+
+@dataclass(frozen=True)
+class BandFocus:
+    """Focus of one point in range.
+
+    Attributes
+    ----------
+    loss_db
+        Peak power relative to the peak power of the same spectrum in phase, dB, 0 or less. The loss caused by noise and
+        neighbours is removed.
+    interference
+        Power of noise and neighbours relative to the power of the point: the log-amplitude variance.
+    phase_rad
+        Quadratic phase at the edges of the band relative to mid-band.
+    """
+
+    loss_db: float
+    interference: float
+    phase_rad: float
+
+
+def band_focus(spectrum: NDArray[np.complex128], weight: NDArray[np.float64]) -> BandFocus | None:
+    """Measure the focus of a point in range; None if the point does not dominate its surroundings in range.
+
+    Parameters
+    ----------
+    spectrum
+        (subcarrier,) complex128, coherent sum of the transfer functions over pulses at the point.
+    weight
+        (subcarrier,) float64, window of the image over the subcarriers.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 1d. Subcarriers are averaged over the shortest blocks in
+    which the point is dominant; this average is a gate in range.
+
+    Examples
+    --------
+    >>> x = np.linspace(-1, 1, 256)
+    >>> focus = band_focus(np.exp(3j * x**2), np.hanning(256))
+    >>> round(focus.loss_db, 1), round(focus.phase_rad, 1)
+    (-0.9, 3.0)
+    >>> band_focus(1 + 0.9 * np.exp(10j * x), np.hanning(256)) is None
+    True
+    """
+    used = np.flatnonzero(weight >= _LEAST_WEIGHT * weight.max())
+    band = slice(int(used[0]), int(used[-1]) + 1)
+    found = _peak_loss(spectrum[band], weight[band], degree=_BAND_TREND, most=_BAND_INTERFERENCE)
+    if found is None:
+        return None
+    # Eq. 1e: second-order term of the phase over x, which is ±1 at the edges of the band.
+    count = len(found.blocks)
+    at = band.start + found.size * (np.arange(count) + 0.5)
+    x = 2 * at / len(spectrum) - 1
+    phase = np.unwrap(np.angle(found.blocks))
+    curved = float(np.polynomial.polynomial.polyfit(x, phase, 2, w=weight[at.astype(np.int64)])[2])
+    return BandFocus(found.loss_db, found.variance, curved)
 
 
 @dataclass(frozen=True)
@@ -292,7 +384,7 @@ class Focus:
     reason: str
 
 
-def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
+def judge(points: Sequence[tuple[float, PointFocus | BandFocus | None]]) -> Focus:
     """Judge the focus of an image from its bright points.
 
     Parameters
