@@ -457,7 +457,7 @@ def noise_peaks(gains: Floats) -> Floats:
     Examples
     --------
     >>> noise_peaks(np.array([[1.0, 1.0], [1.0, 4.0], [1.0, 1.0]])).round(1)
-    array([1. , 2.7])
+    array([1. , 2.5])
     """
     gains = np.maximum(gains, np.finfo(np.float32).tiny)
     if (gains.max(axis=0) <= _CONSTANT * gains.min(axis=0)).all():
