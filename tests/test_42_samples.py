@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from folders import edit_config
+from folders import edit_config, state
 
 from apertura.campaign.config import validated
 from apertura.campaign.folder import Campaign
@@ -185,6 +185,22 @@ def test_waveform_inconsistent_with_the_recording_is_reported_by_check(tiny, cha
     edit_config(tiny, lambda document: document["waveform"].update(changed))
     lines = [str(problem) for problem in problems(tiny)]
     assert any(message in line for line in lines), lines
+
+
+def test_lines_of_a_matched_pulse_are_not_removed_as_interference(tmp_path):
+    """Profiles of both pairs are those without removal of interference."""
+    pulse = PulseSpecification("pn", bandwidth_hz=512e6, pulse_s=1e-6, filter="matched", **SIZES)
+    root, profiles = tmp_path / "campaign", []
+    simulate(root, preset("demo", pulses=60), waveform=pulse, targets=TARGETS)
+    process(root, last="scene")
+    for setting in ("none", "auto"):
+        campaign = state(root, "processing", interference=setting, autofocus="off")
+        process(campaign, first="echo", last="profile")
+        stages = [open_stage(campaign.stage("profile", "f01", pair), "profile") for pair in PAIRS]
+        assert not [flag for stage in stages for flag in stage.attrs["flags"] if flag.startswith("interference")]
+        profiles.append([stage.profile.values for stage in stages])
+    for unchanged, cleaned in zip(*profiles, strict=True):
+        np.testing.assert_array_equal(cleaned, unchanged)
 
 
 @pytest.mark.quick("2.5e-07-True")

@@ -227,6 +227,12 @@ STAGES: Mapping[str, Stage] = {
             "sidelink_vector": Variable(
                 ("pulse", "axis"), "float64", "m", "vector from the receiver's to the transmitter's sidelink antenna"
             ),
+            "noise_excess": Variable(
+                ("subcarrier",), "float32", "1", "noise relative to that of the neighbours, without interference"
+            ),
+            "noise_peak": Variable(
+                ("subcarrier",), "float32", "1", "largest noise relative to that of a constant gain of the pulses"
+            ),
             "symbol_channel": Variable(
                 ("symbol_group", "subcarrier"), "complex64", "1", "mean channel of the sidelink for unknown symbols"
             ),

@@ -44,7 +44,14 @@ from apertura.stages.calibration import calibrated, calibration_spec
 from apertura.stages.positions import PulsePositions, place, scene_air, stated_air
 from apertura.stages.symbols import PairSymbols, ambiguous_symbols, rows_of
 from apertura.stages.tags import stamped
-from apertura.stages.transfer import FEWEST_PULSES, PairEcho, demodulator_of, recorded_echo, save_transfer
+from apertura.stages.transfer import (
+    FEWEST_PULSES,
+    PairEcho,
+    demodulator_of,
+    noise_variables,
+    recorded_echo,
+    save_transfer,
+)
 from apertura.stages.transmitted import Transmitted, transmitted
 from apertura.workflow.lineage import result_of
 
@@ -174,6 +181,7 @@ def pair_echo(
     )
     if processing.interference != "none":
         unchanged = processing.model_copy(update={"interference": "none"})
+        dataset = dataset.assign(noise_variables(dataset, rx, sent, unchanged))
         lines = _tone_lines(PairEcho.formed(dataset, lambda: (rx, sent, unchanged)))
         dataset = dataset.assign_attrs(tone_lines=lines)
     return PairEcho.formed(dataset, lambda: (rx, sent, processing))
@@ -196,7 +204,8 @@ def _tone_lines(echo: PairEcho) -> list[int]:
     groups, subcarriers = sampled_pulses(echo.shape[0]), echo.shape[1]
     sampled = runs(groups, [echo.read(group) for group in groups])
     equal = np.full(subcarriers, 1 / subcarriers)
-    return Interference.measured(sampled, echo.dataset.frequency.values, equal).lines
+    frequency, expected = echo.dataset.frequency.values, echo.expected_excess
+    return Interference.measured(sampled, frequency, equal, expected=expected).lines
 
 
 def _attributes(

@@ -136,7 +136,8 @@ def _decide(echo: PairEcho, scene: OpenScene, processing: Processing) -> _Cleani
     sampled = [echo.read(group) for group in pulses] if (processing.interference, method) != ("none", "none") else []
     weight = window_weights(processing.window, echo.shape[1])
     if processing.interference != "none":
-        cleaning = _Cleaning(Interference.measured(runs(pulses, sampled), frequency, weight))
+        expected = echo.expected_excess
+        cleaning = _Cleaning(Interference.measured(runs(pulses, sampled), frequency, weight, expected=expected))
         if cleaning.gain is not None:
             echo = replace(echo, gain=cleaning.gain)
             sampled = [group * cleaning.gain for group in sampled]

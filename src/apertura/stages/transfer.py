@@ -23,7 +23,7 @@ from apertura.common.flags import Flags
 from apertura.common.units import nanoseconds, seconds_since
 from apertura.core.echo.association import missing_flags
 from apertura.core.echo.background import Background
-from apertura.core.echo.captures import Pulses, Saturation, blocks_of
+from apertura.core.echo.captures import Pulses, Read, Saturation, blocks_of
 from apertura.core.echo.compression import window_weights
 from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.demodulate import remove_path
@@ -31,7 +31,7 @@ from apertura.core.echo.interference import PulsedInterference
 from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.symbol_filter import filter_of
 from apertura.core.echo.tones import Tones
-from apertura.core.echo.transfer import Correction, Demodulator, forming
+from apertura.core.echo.transfer import Correction, Demodulator, forming, noise_statistics
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.stages.acquisition import Acquisition, open_acquisition
 from apertura.stages.node_log import raw_log, read_history, shortest_wave
@@ -130,16 +130,11 @@ class PairEcho:
 
         @cache
         def source() -> Form:
-            rx, sent, processing = receiver()
-            frames = np.zeros(len(rx.raw.start), np.int64)
-            frames[dataset.capture.values] = dataset.frame.values
-            demodulator = demodulator_of(rx, sent, processing, frames)
-            demodulator = replace(demodulator, filter=filter_of(dataset.attrs.get("symbols", {})))
+            read, demodulator = _receiver(dataset, *receiver())
             tones.update(demodulator.tones)
             for channel in tones.values():
                 channel.lines = tuple(dataset.attrs.get("tone_lines", ()))
-            channels = ["radar", "sidelink"] if "sidelink_amplitude" in dataset else ["radar"]
-            return forming(rx.reader(channels, np.arange(len(rx.raw.start))), demodulator, saturation)
+            return forming(read, demodulator, saturation)
 
         def form(captures: Pulses, correction: Correction | None) -> Complexes:
             return source()(captures, correction)
@@ -184,9 +179,15 @@ class PairEcho:
         return Flags.merged(self.dataset.attrs["flags"], self.saturation.flags, tones)
 
     @property
-    def noise_peak(self) -> float:
-        """Largest noise of a symbol relative to that of constant modulus; 1 if the symbols do not change."""
-        return float(self.dataset.attrs.get("symbols", {}).get("noise_peak", 1.0))
+    def noise_peak(self) -> Floats | float:
+        """Largest noise relative to that of a constant gain; 1 if it is constant."""
+        of_symbols = float(self.dataset.attrs.get("symbols", {}).get("noise_peak", 1.0))
+        return np.maximum(of_symbols, self.dataset.noise_peak.values) if "noise_peak" in self.dataset else of_symbols
+
+    @property
+    def expected_excess(self) -> Floats | float:
+        """Noise of each subcarrier relative to that of its neighbours without interference, as of `expected_excess`."""
+        return self.dataset.noise_excess.values if "noise_excess" in self.dataset else 1.0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -297,8 +298,36 @@ def demodulator_of(
     frames
         (capture,) int64, frame number of each capture by its number in the reader of samples.
     """
-    create = Demodulator if processing.interference == "none" else Demodulator.without_tones
-    return create(lambda captures: sent.inverses.at(frames[captures]), rx.numerology, sent.waveform.capture_samples)
+    demodulator = Demodulator(
+        lambda captures: sent.inverses.at(frames[captures]),
+        rx.numerology,
+        sent.waveform.capture_samples,
+        spectrum=sent.spectrum,
+    )
+    return demodulator if processing.interference == "none" else demodulator.without_tones()
+
+
+def _receiver(
+    dataset: xr.Dataset, rx: Acquisition, sent: Transmitted, processing: Processing
+) -> tuple[Read, Demodulator]:
+    """Return the reader of a receiving node's samples by capture index, and the demodulator of stage `echo`."""
+    frames = np.zeros(len(rx.raw.start), np.int64)
+    frames[dataset.capture.values] = dataset.frame.values
+    demodulator = demodulator_of(rx, sent, processing, frames)
+    channels = ["radar", "sidelink"] if "sidelink_amplitude" in dataset else ["radar"]
+    read = rx.reader(channels, np.arange(len(rx.raw.start)))
+    return read, replace(demodulator, filter=filter_of(dataset.attrs.get("symbols", {})))
+
+
+def noise_variables(
+    dataset: xr.Dataset, rx: Acquisition, sent: Transmitted, processing: Processing
+) -> dict[str, tuple[str, NDArray[np.float32]]]:
+    """Return the variables `noise_excess` and `noise_peak` of a stage `echo`."""
+    statistics = noise_statistics(
+        *_receiver(dataset, rx, sent, processing), dataset.capture.values, _correction(dataset)
+    )
+    names = "noise_excess", "noise_peak"
+    return {name: ("subcarrier", values.astype(np.float32)) for name, values in zip(names, statistics, strict=True)}
 
 
 def _correction(stage: xr.Dataset) -> Correction | None:

@@ -93,6 +93,8 @@ class Transmitted:
         the mean over the rows of a code table.
     power
         (row, subcarrier) float32, |c_n|² in sampled rows of a code table; None for a pulse.
+    spectrum
+        (1, subcarrier) complex64, spectrum of a pulse; None for symbols, whose inverse filter is the reciprocal.
     report, flags
         Report and flags of the inverse filter.
     unknown
@@ -107,6 +109,7 @@ class Transmitted:
     report: dict[str, Any] = field(default_factory=dict)
     flags: dict[str, str] = field(default_factory=dict)
     power: NDArray[np.float32] | None = None
+    spectrum: Complexes | None = None
     unknown: "UnknownSymbols | None" = None
 
     def filter_choice(
@@ -234,7 +237,7 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
         )
     if isinstance(waveform, PulseWaveform) and path is not None:
         pulse = _chirp(waveform) if assumes else read_pulse(path, waveform)
-        return _transmitted_pulse(pulse, waveform, where=path)
+        return transmitted_pulse(pulse, waveform, where=path)
     raise TypeError(f"no inverse filter for a {type(waveform).__name__}")
 
 
@@ -276,7 +279,7 @@ def _chirp(waveform: PulseWaveform) -> NDArray[np.complex128]:
     return np.asarray(np.exp(2j * np.pi * (low * time + (high - low) / waveform.pulse_s * time**2 / 2)))
 
 
-def _transmitted_pulse(pulse: NDArray[np.complex128], waveform: PulseWaveform, *, where: Path) -> Transmitted:
+def transmitted_pulse(pulse: NDArray[np.complex128], waveform: PulseWaveform, *, where: Path) -> Transmitted:
     """Return a single transmitted pulse: DFT over the whole capture, and its filter (docs/theory/waveforms.md)."""
     length = waveform.capture_samples
     lead = waveform.lead_s * waveform.sample_rate_hz
@@ -305,7 +308,8 @@ def _transmitted_pulse(pulse: NDArray[np.complex128], waveform: PulseWaveform, *
     band_hz = [float(number * numerology.spacing_hz) for number in (first, last)]
     report = {**chosen.report, "band_hz": band_hz, "energy_inside": round(inside, 4)}
     mean_power = float((np.abs(pulse) ** 2).mean())
-    return Transmitted(waveform, numerology, Inverses.fixed(chosen.inverse), mean_power, report, chosen.flags)
+    inverses, inside_band = Inverses.fixed(chosen.inverse), spectrum[numbers % length].astype(np.complex64)[None]
+    return Transmitted(waveform, numerology, inverses, mean_power, report, chosen.flags, spectrum=inside_band)
 
 
 def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:

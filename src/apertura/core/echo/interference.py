@@ -4,7 +4,7 @@ docs/theory/interference.md: subcarriers (eq. 1 to 3), subcarriers of single pul
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -81,7 +81,7 @@ class Interference:
     noise
         (subcarrier,) float64, noise power (eq. 1).
     excess
-        (subcarrier,) float64, noise power relative to that of the neighbours.
+        (subcarrier,) float64, noise power relative to that of the neighbours and to the expected ratio.
     weight
         (subcarrier,) float64, of range compression; sums to 1.
     """
@@ -92,7 +92,9 @@ class Interference:
     weight: Floats
 
     @classmethod
-    def measured(cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats) -> "Interference":
+    def measured(
+        cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats, *, expected: Floats | float = 1.0
+    ) -> "Interference":
         """Measure the noise of each subcarrier on groups of consecutive pulses.
 
         Parameters
@@ -102,10 +104,12 @@ class Interference:
             joined by `apertura.core.echo.captures.runs`.
         frequency_hz, weight
             Of the subcarriers.
+        expected
+            (subcarrier,) excess without interference, as of `expected_excess`.
 
         Notes
         -----
-        Source: docs/theory/interference.md, eq. 1.
+        Source: docs/theory/interference.md, eq. 1 and 13.
 
         Examples
         --------
@@ -125,7 +129,7 @@ class Interference:
             changes = np.zeros((1, len(frequency_hz)))
         noise = changes.mean(axis=0, dtype=np.float64)
         # The median ignores interference in single pulses, which `PulsedInterference` removes from these pulses only.
-        excess = np.minimum(*(values / _usual(values) for values in (noise, np.median(changes, axis=0))))
+        excess = np.minimum(*(values / _usual(values) for values in (noise, np.median(changes, axis=0)))) / expected
         return cls(frequency_hz, noise, excess, weight)
 
     @property
@@ -214,6 +218,29 @@ def _usual(values: Floats) -> Floats:
     return np.asarray(np.where(usual > 0, usual, np.maximum(values, np.finfo(np.float64).tiny)))
 
 
+def expected_excess(noise_gain: Floats, echo_gain: Floats, usual: Callable[[Floats], Floats] = _usual) -> Floats:
+    """Return the largest excess that a mixture of noise and echoes has without interference, at least 1.
+
+    Parameters
+    ----------
+    noise_gain, echo_gain
+        (subcarrier,) float64, power of the noise and of the echoes after all filters, for equal powers before them.
+    usual
+        Level of the neighbours.
+
+    Notes
+    -----
+    Source: docs/theory/interference.md, eq. 13.
+
+    Examples
+    --------
+    >>> flat, pulse = np.ones(9), np.array([1.0, 1, 1, 1, 5, 1, 1, 1, 1])
+    >>> expected_excess(pulse, pulse**2, np.median).tolist()  # matched filter
+    [1.0, 1.0, 1.0, 1.0, 25.0, 1.0, 1.0, 1.0, 1.0]
+    """
+    return np.maximum(1.0, np.maximum(*(gain / usual(gain) for gain in (noise_gain, echo_gain))))
+
+
 # ---- Sidelink --------------------------------------------------------------------------------------------------------
 
 
@@ -228,8 +255,8 @@ def limited(spectra: Complexes, weight: NDArray[np.float32] | None = None) -> tu
     spectra
         (pulse, subcarrier) complex64, code removed.
     weight
-        (pulse or 1, subcarrier) float32, inverse noise power of the subcarriers, mean 1 over each pulse: the limit of
-        noisier subcarriers is higher by it. None: equal noise.
+        (pulse or 1, subcarrier) float32, inverse noise power of the subcarriers, mean 1 over each pulse, or inverse of
+        their expected excess: the limit of noisier subcarriers is higher by it. None: equal noise.
 
     Notes
     -----
@@ -318,18 +345,18 @@ class PulsedInterference:
     report
         Measured on some pulses, as JSON values: shares, strongest frequency, excess and gain.
     noise_peak
-        Largest noise of a symbol relative to that of symbols of constant modulus, by which limits are raised if the
-        symbols change from pulse to pulse.
+        Largest noise relative to that of a constant gain, one value or (subcarrier,) float, by which limits are raised
+        if the noise gain changes from pulse to pulse.
     """
 
     level: NDArray[np.float32]
     weight: Floats
     report: dict[str, Any] = field(default_factory=dict)
-    noise_peak: float = 1.0
+    noise_peak: Floats | float = 1.0
 
     @classmethod
     def measured(
-        cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats, *, noise_peak: float = 1.0
+        cls, groups: Sequence[Complexes], frequency_hz: Floats, weight: Floats, *, noise_peak: Floats | float = 1.0
     ) -> "PulsedInterference | None":
         """Measure the interference on some pulses; None if its exclusion would gain less than `LEAST_GAIN_DB`.
 
@@ -391,8 +418,8 @@ class PulsedInterference:
         inverse = np.divide(1.0, self.level, out=np.zeros_like(self.level), where=self.level > 0)
         relative = (np.square(transfer.real) + np.square(transfer.imag)) * inverse
         relative /= np.maximum(np.median(relative[:, self.level > 0], axis=1, keepdims=True), np.finfo(np.float32).tiny)
-        limit = np.where(relative.max(axis=1) > _HIT * self.noise_peak, _SKIRT, _HIT) * np.float32(self.noise_peak)
-        hits = relative > limit[:, None]
+        relative /= np.float32(self.noise_peak)
+        hits = relative > np.where(relative.max(axis=1, keepdims=True) > _HIT, _SKIRT, _HIT)
         hits &= (hits @ self.weight <= _MOST_OF_PULSE)[:, None]
         return np.asarray(hits)
 
@@ -413,6 +440,42 @@ class PulsedInterference:
             f"{self.report['excess_db']:.1f} dB above the level; excluded"
         )
         return Flags({"interference_pulsed": line})
+
+
+def noise_peaks(gains: Floats) -> Floats:
+    """Return the largest noise of each subcarrier relative to that of a constant gain, (subcarrier,) float64.
+
+    Parameters
+    ----------
+    gains
+        (pulse, subcarrier), gain of the noise power in some pulses.
+
+    Notes
+    -----
+    Source: docs/theory/interference.md, eq. 14, solved by bisection in log t.
+
+    Examples
+    --------
+    >>> noise_peaks(np.array([[1.0, 1.0], [1.0, 4.0], [1.0, 1.0]])).round(1)
+    array([1. , 2.5])
+    """
+    gains = np.maximum(gains, np.finfo(np.float32).tiny)
+    if (gains.max(axis=0) <= _CONSTANT * gains.min(axis=0)).all():
+        return np.ones(gains.shape[1])
+
+    def exceeded(logarithm: float) -> Floats:
+        low, high = np.log(gains.min(axis=0)) - 3, np.log(gains.max(axis=0)) + 4
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            is_above = np.exp(-np.exp(middle) / gains).mean(axis=0) > np.exp(-logarithm)
+            low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+        return np.asarray(np.exp(high))
+
+    return exceeded(_HIT * np.log(2)) / (_HIT * exceeded(np.log(2)))
+
+
+_CONSTANT = 1.01  # ratio of largest and smallest gain, below which limits are not raised
+_BISECTIONS = 24  # to 1e-5 of the limit for gains within a factor of 1e16
 
 
 # ---- Pulses with excess noise ----------------------------------------------------------------------------------------

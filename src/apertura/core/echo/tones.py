@@ -45,6 +45,8 @@ class Tones:
         Numerology of the captures.
     lines
         Numbers of subcarriers with a tone in all captures, which is subtracted whatever its power.
+    sent
+        (1, subcarrier) complex64, spectrum of the transmitted pulses; None: the reciprocal of their inverse spectra.
     captures, affected
         Number of captures, and of those from which a tone was removed.
     power
@@ -53,6 +55,7 @@ class Tones:
 
     numerology: Numerology
     lines: tuple[int, ...] = ()
+    sent: Complexes | None = None
     captures: int = 0
     affected: int = 0
     power: Floats = field(init=False)
@@ -117,10 +120,16 @@ class Tones:
     def _shape_of(self, inverse: Complexes) -> NDArray[np.float32]:
         """Return the power of transmitted spectra relative to the mean of each, at least 0.1."""
         if self._shape is None or self._shape[0] is not inverse:
-            gain = np.square(inverse.real) + np.square(inverse.imag)
-            power = np.divide(1, gain, out=np.zeros_like(gain), where=gain > 0)
+            sent = self._sent(inverse)
+            power = np.square(sent.real) + np.square(sent.imag)
             self._shape = inverse, np.maximum(power / power.mean(axis=1, keepdims=True), np.float32(0.1))
         return self._shape[1]
+
+    def _sent(self, inverse: Complexes) -> Complexes:
+        """Return the transmitted spectra, (1 or pulse, subcarrier) complex64; 0 where the inverse is 0."""
+        if self.sent is not None:
+            return self.sent
+        return np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse != 0)
 
     def _subtracted(
         self, symbols: Complexes, pulses: NDArray[np.intp], peak: NDArray[np.intp], tone: Complexes
@@ -156,9 +165,9 @@ class Tones:
         terms = 3 + int(np.ceil(cells))
         delays = np.linspace(-0.5, cells + 0.5, terms) / _WIDTH
         turns = np.exp(-2j * np.pi * numerology.numbers[near][..., None] * delays)
-        around = np.take_along_axis(np.broadcast_to(inverse, (len(near), inverse.shape[1])), near, axis=1)
-        sent = np.divide(1.0, around, out=np.zeros(near.shape, np.complex128), where=around != 0)
-        return np.asarray(sent[..., None] * turns / np.sqrt(_WIDTH))
+        sent = self._sent(inverse).astype(np.complex128)
+        around = np.take_along_axis(np.broadcast_to(sent, (len(near), sent.shape[1])), near, axis=1)
+        return np.asarray(around[..., None] * turns / np.sqrt(_WIDTH))
 
     def _fitted(
         self, symbols: Complexes, peak: NDArray[np.intp], inverse: Complexes, shape: NDArray[np.float32]

@@ -27,11 +27,12 @@ from apertura.core.echo.captures import (
     blocks_of,
     conjugates,
     correct_clock,
+    sampled_pulses,
     spread,
 )
 from apertura.core.echo.clock import GROUPS, clock_of, decide_clock, repeated_share
 from apertura.core.echo.demodulate import Numerology, demodulate
-from apertura.core.echo.interference import SidelinkInterference, limited
+from apertura.core.echo.interference import SidelinkInterference, expected_excess, limited, noise_peaks
 from apertura.core.echo.line_of_sight import LineOfSight, Weights
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
 from apertura.core.echo.sidelink import DIVIDING, LEAST_NOISE, METHODS, choose, edges
@@ -103,6 +104,8 @@ class Demodulator:
         Channel → removal of tones of other transmitters; empty: tones are not removed.
     filter
         Filter of symbols of varying modulus in the radar channel; None: the modulus is constant.
+    spectrum
+        (1, subcarrier) complex64, spectrum of the transmitted pulse, whose filter is not its reciprocal; None: it is.
     """
 
     inverse: Inverse
@@ -110,12 +113,12 @@ class Demodulator:
     symbol_samples: int
     tones: Mapping[str, Tones] = field(default_factory=dict)
     filter: SymbolFilter | None = None
+    spectrum: Complexes | None = None
 
-    @classmethod
-    def without_tones(cls, inverse: Inverse, numerology: Numerology, symbol_samples: int) -> "Demodulator":
+    def without_tones(self) -> "Demodulator":
         """Return a demodulator that removes the tones of other transmitters from both channels."""
-        tones = {channel: Tones(numerology) for channel in ("radar", "sidelink")}
-        return cls(inverse, numerology, symbol_samples, tones)
+        tones = {channel: Tones(self.numerology, sent=self.spectrum) for channel in ("radar", "sidelink")}
+        return replace(self, tones=tones)
 
     def symbols(
         self,
@@ -156,7 +159,8 @@ class Demodulator:
         if correction is None:
             return radar
         sidelink, weight = self.symbols(iq["sidelink"], captures, *clock, channel="sidelink"), self.weight(captures)
-        return METHODS[correction.method](radar, limited(sidelink, weight)[0], correction.path, weight)
+        sidelink = limited(sidelink, self.limit_weight(captures))[0]
+        return METHODS[correction.method](radar, sidelink, correction.path, weight)
 
     def weight(self, captures: Pulses) -> Weights | None:
         """Return |c|² of symbols of varying modulus, mean 1 over each pulse, the weights of a sidelink."""
@@ -165,6 +169,26 @@ class Demodulator:
         inverse = self.inverse(captures)
         power = 1 / (np.square(inverse.real) + np.square(inverse.imag))
         return np.asarray(power / power.mean(axis=1, keepdims=True), np.float32)
+
+    def limit_weight(self, captures: Pulses) -> Weights | None:
+        """Return the weights by which limits of a sidelink are raised, as of `limited`."""
+        if self.spectrum is None:
+            return self.weight(captures)
+        noise = np.abs(self.inverse(captures)[0]) ** 2
+        return np.asarray(1 / expected_excess(noise, noise * self.sent_power(captures)[0], np.median), np.float32)[None]
+
+    def sent_power(self, captures: Pulses) -> Floats:
+        """Return the power of the transmitted spectra, (1 or pulse, subcarrier)."""
+        return np.abs(1 / self.inverse(captures) if self.spectrum is None else self.spectrum) ** 2
+
+    def gain(self, iq: Mapping[str, Samples], captures: Pulses, correction: Correction | None = None) -> Floats:
+        """Return the gain of the radar channel's noise power in transfer functions, (pulse, subcarrier) float32.
+
+        It is the response to an impulse in the radar channel. Parameters as of `transfer`.
+        """
+        impulse = np.zeros(iq["radar"].shape, np.float32)
+        impulse[:, self.numerology.prefix_samples + self.numerology.dft_samples // 2, 0] = self.numerology.dft_samples
+        return np.square(np.abs(replace(self, tones={}).transfer({**iq, "radar": impulse}, captures, correction)))
 
 
 @dataclass(frozen=True)
@@ -421,6 +445,36 @@ def forming(
     return form
 
 
+def noise_statistics(
+    read: Read, demodulator: Demodulator, captures: Pulses, correction: Correction | None = None
+) -> tuple[Floats, Floats]:
+    """Return the expected excess and the largest noise of subcarriers, from the gain in some of the captures.
+
+    Parameters
+    ----------
+    read, demodulator
+        Reader of the captures, and their demodulator.
+    captures, correction
+        (pulse,) int64, numbers of the captures, and their correction.
+
+    Returns
+    -------
+    tuple of ndarray
+        (subcarrier,) float64: see `expected_excess` and `noise_peaks`.
+
+    Notes
+    -----
+    Source: docs/theory/interference.md, eq. 13 and 14.
+    """
+    gains, echoes = [], []
+    for pulses in sampled_pulses(len(captures)):
+        block = captures[pulses]
+        gains.append(demodulator.gain(read(block), block, correction and correction.select(pulses)))
+        echoes.append(gains[-1] * demodulator.sent_power(block))
+    noise, echo = (np.median(np.concatenate(values), axis=0).astype(np.float64) for values in (gains, echoes))
+    return expected_excess(noise, echo), noise_peaks(np.concatenate(gains))
+
+
 def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> bool:
     """Return True if, after removal of the code, only the conjugated samples of the sidelink compress to a path."""
     pulses = np.concatenate(spread(count, groups=4, each=16))
@@ -483,8 +537,8 @@ class _Receiver:
             clock_hz = None if self.clock_hz is None else self.clock_hz[block]
             iq = self.read(block)["sidelink"]
             symbols = self.demodulator.symbols(iq, block, clock_hz, self.sfo_ppm, channel="sidelink")
-            weight = self.demodulator.weight(block)
-            yield interference.limit(symbols, weight), weight
+            symbols = interference.limit(symbols, self.demodulator.limit_weight(block))
+            yield symbols, self.demodulator.weight(block)
             done(len(block))
 
     def radar(self) -> Complexes:

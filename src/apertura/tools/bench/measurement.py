@@ -462,7 +462,7 @@ class _Code:
         length, numerology = self.sent.waveform.capture_samples, self.captured.numerology
         return (
             self.captured.reader(channels, captures),
-            Demodulator(lambda pulses: inverses.at(rows[pulses]), numerology, length),
+            Demodulator(lambda pulses: inverses.at(rows[pulses]), numerology, length, spectrum=self.sent.spectrum),
         )
 
     def transfer(self, channel: str, captures: Pulses) -> Callable[[Pulses], Complexes]:
