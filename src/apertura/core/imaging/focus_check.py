@@ -31,6 +31,7 @@ from apertura.core.quality.focus import (
     compare_parts,
     judge,
     judge_parts,
+    loss_std_db,
     point_focus,
 )
 from apertura.core.quality.measures import coherence_factor, weighted_median
@@ -503,7 +504,7 @@ def _uneven(
     worse = [
         (focus.loss_db, point)
         for point, focus in pairs
-        if focus.loss_db - verdict.loss_db < _UNEVEN_DB - _UNEVEN_SIGMAS * focus.std_db
+        if focus.loss_db - verdict.loss_db < _UNEVEN_DB - _UNEVEN_SIGMAS * loss_std_db(focus)
     ]
     if verdict.verdict == "defocused" or not worse:
         return None

@@ -198,11 +198,6 @@ class PointFocus:
     coherence: float = 1.0
     coherence_noise_limit: float = 1.0
 
-    @property
-    def std_db(self) -> float:
-        """Standard deviation of the loss from noise and neighbours, dB."""
-        return 10 / float(np.log(10)) * self.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02
-
 
 def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
     """Measure the focus of a point; None if the point does not dominate its range cell over the whole aperture.
@@ -403,7 +398,7 @@ def judge(points: Sequence[tuple[float, PointFocus | BandFocus | None]]) -> Focu
     if not measured:
         return Focus("inconclusive", float("nan"), float("nan"), 0, "no bright point")
     losses = np.array([focus.loss_db for _, focus in measured])
-    stds = np.array([focus.std_db for _, focus in measured])
+    stds = np.array([loss_std_db(focus) for _, focus in measured])
     weights = np.array([amplitude for amplitude, _ in measured])
     loss = weighted_median(losses, weights)
     spread = 1.4826 * weighted_median(np.abs(losses - loss), weights)
@@ -414,6 +409,11 @@ def judge(points: Sequence[tuple[float, PointFocus | BandFocus | None]]) -> Focu
     if verdict == "inconclusive":
         line += f": within two standard deviations of the limit, {-DEFOCUSED_DB:g} dB"
     return Focus(verdict, loss, std, len(measured), line)
+
+
+def loss_std_db(focus: PointFocus | BandFocus) -> float:
+    """Return the standard deviation of the loss of a point from noise and neighbours, dB."""
+    return 10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02
 
 
 def verdict_of_loss(loss_db: float, std_db: float) -> Verdict:
