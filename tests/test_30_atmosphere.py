@@ -256,6 +256,7 @@ VACUUM = {
     "workflow/resources.py": _SIZE,
     "check/facts.py": _DRAWN,
     "stages/hypotheses.py": _SIZE,
+    "stages/refine.py": _SIZE,
     "stages/echo.py": _ELECTRICAL,
     "stages/image_tags.py": "wavelength written next to the frequency",
     "stages/transfer.py": _ELECTRICAL,
