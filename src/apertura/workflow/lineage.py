@@ -35,6 +35,9 @@ _FOCUSES = frozenset(
 )
 """Modules that call engines; a step that imports one of these modules depends on the code of all engines."""
 
+_PROCESSES = "apertura.run.process"
+"""Module that runs the steps of `RESULTS`; a step that imports it depends on the code of all stages."""
+
 _KEPT = {"transfer": "echo"}
 """Result that is written on demand → value of `processing.keep` with which every run writes the result."""
 
@@ -209,7 +212,10 @@ def modules_of(campaign: Campaign, result: str, *where: str) -> tuple[str, ...]:
         See `result_of`.
     """
     rule = RESULTS[result]
-    step = (rule.module, *_written(rule, measured=bool(campaign.coefficients)))
+    processed = _PROCESSES in _closure((rule.module,))
+    rows = [rule, *(row for row in RESULTS.values() if processed and row.module.startswith("apertura.stages."))]
+    measured = bool(campaign.coefficients)
+    step = tuple(dict.fromkeys(name for row in rows for name in (row.module, *_written(row, measured=measured))))
     runs = _closure(step)
     engines = tuple(ENGINES.values()) if _FOCUSES & runs else ()
     readers = sorted(set(_readers(campaign, rule, where))) if _READS in runs else ()
