@@ -1,7 +1,7 @@
 """Peak memory and run time of the steps that write products, on a synthetic campaign of any size.
 
-    python -m benchmarks.products export --side 16384          files of one pair
-    python -m benchmarks.products cube --side 8192 --pairs 3   the cube, then the files of the sums
+    python -m benchmarks.products export --side 16384  files of one pair
+    python -m benchmarks.products cube --side 8192     the cube, then the files of the sums
 
 A small simulated campaign is processed up to its images; then its grid is enlarged and its images are replaced by
 speckle, with a fifth of the tiles not illuminated by any pulse. Each step runs in a separate process.
@@ -30,8 +30,8 @@ TILE = 256
 LIT = 0.8
 
 
-def prepare(root: Path, side: int, receivers: int) -> Campaign:
-    """Write the campaign, with speckle of side × side pixels for each pair."""
+def prepare(root: Path, side: int, pairs: int | None) -> Campaign:
+    """Write the campaign, with speckle of side × side pixels for the first pairs, or for all."""
     plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     start = plan.flights[0].tracks["uav2"].start_m
     third = replace(plan.flights[0].tracks["uav2"], start_m=(start[0] - 3.0, start[1] - 3.6, start[2]))
@@ -42,7 +42,7 @@ def prepare(root: Path, side: int, receivers: int) -> Campaign:
     settled = json.loads(campaign.result("scene.json").read_text())
     settled["grid"]["shape"] = [side, side]
     save_document(campaign.result("scene.json"), settled)
-    for number, pair in enumerate(flight.pairs[:receivers]):
+    for number, pair in enumerate(flight.pairs[:pairs]):
         enlarge(campaign, flight.name, pair, number)
     return campaign
 
@@ -90,16 +90,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("step", choices=["export", "cube"])
     parser.add_argument("--side", type=int, default=16384)
-    parser.add_argument("--pairs", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("/tmp/apertura-products"))
     options = parser.parse_args()
     shutil.rmtree(options.folder, ignore_errors=True)
-    campaign = prepare(options.folder, options.side, 1 if options.step == "export" else options.pairs)
+    campaign = prepare(options.folder, options.side, 1 if options.step == "export" else None)
     (flight,) = campaign.image_flights
     if options.step == "export":
-        measured(options.folder, "export", flight.name, flight.pairs[0])
+        for step in ("layers", "export"):
+            measured(options.folder, step, flight.name, flight.pairs[0])
         return
     measured(options.folder, "cube")
+    for pair in flight.pairs:
+        measured(options.folder, "layers", flight.name, pair)
     measured(options.folder, "export", flight.name, "fused")
 
 
