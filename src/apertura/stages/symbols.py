@@ -179,9 +179,10 @@ class PairSymbols:
     def flags(self, usable: NDArray[np.bool_]) -> dict[str, str]:
         """Return the flags of unsure pulses of the source, and of the check of sure ones; `usable`: used pulses."""
         raised = dict[str, str]()
-        if self.check is not None:
-            check = self.check
-            raised = check.larger if self._divided else check_flags(check, self.recorded, self.sent, self.accuracy_db)
+        if self.check is not None and self._divided:
+            raised = self.check.larger
+        elif self.check is not None:
+            raised = check_flags(self.check, self.recorded, self.sent, self.accuracy_db)
         checked = {flag: f"sidelink of {self.source}: {line}" for flag, line in raised.items()}
         return Flags.merged(checked, self.symbols.flags(usable[self.rows >= 0], divided=self._divided))
 

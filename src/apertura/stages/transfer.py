@@ -360,8 +360,7 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
     ------
     CampaignError
         If positions are stored neither with the samples nor in a flight log, or in both; if their frame is not that of
-        the scene; or if there are fewer than `FEWEST_PULSES` pulses, or all
-        their positions are equal.
+        the scene; or if there are fewer than `FEWEST_PULSES` pulses, or all their positions are equal.
     """
     tx, rx = pair.split("-")
     history = read_history(campaign, flight, rx, pair=pair)

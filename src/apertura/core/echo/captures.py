@@ -184,7 +184,7 @@ class Saturation:
     def shares(self) -> dict[str, float]:
         """Share of each channel's samples that repeat its largest or smallest value."""
         return {
-            name: (sum(extreme.repeats for extreme in self._extremes[name])) / count
+            name: sum(extreme.repeats for extreme in self._extremes[name]) / count
             for name, count in self._samples.items()
         }
 

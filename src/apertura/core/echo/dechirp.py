@@ -226,10 +226,12 @@ class SweepPower:
             is_window = (parts[: len(idle)] < (level + rest) / 2).all()
             if is_sharp and not is_window and level - rest > _IDLE_DROP * level:
                 last_s = (self._sweep.first + edges[end : end + 2].mean()) / self._sweep.sample_rate_hz
+                drop_db = decibels(level / max(rest, 1e-9 * level))
                 line = (
-                    f"the power of the samples decreases by {decibels(level / max(rest, 1e-9 * level)):.1f} dB after "
+                    f"the power of the samples decreases by {drop_db:.1f} dB after {last_s:.3g} s; waveform.sweep_s is "
+                    f"{self._sweep.sweep_s:.3g} s"
                 )
-                return {"sweep_idle": f"{line}{last_s:.3g} s; waveform.sweep_s is {self._sweep.sweep_s:.3g} s"}
+                return {"sweep_idle": line}
         return {}
 
 

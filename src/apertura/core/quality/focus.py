@@ -330,8 +330,8 @@ def band_focus(spectrum: NDArray[np.complex128], weight: NDArray[np.float64]) ->
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 1d. Subcarriers are averaged over the shortest blocks in
-    which the point is dominant; this average is a gate in range.
+    Source: docs/theory/focus.md, eq. 1d. Subcarriers are averaged over the shortest blocks in which the point is
+    dominant; this average is a gate in range.
 
     Examples
     --------

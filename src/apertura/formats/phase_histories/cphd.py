@@ -162,15 +162,15 @@ class _Vectors:
 
     def __getitem__(self, index: Any) -> NDArray[np.complex64]:
         rows, columns = index if isinstance(index, tuple) else (index, slice(None))
-        raw = self._samples[rows][:, self._columns]
+        raw, frequency = self._samples[rows][:, self._columns][:, columns], self.frequency[columns]
         with np.errstate(over="ignore", invalid="ignore"):  # overflow becomes infinity and is rejected later
             values = raw.astype(np.complex64) if raw.ndim == 2 else raw[..., 0] + np.complex64(1j) * raw[..., 1]
             if self._scale is not None:
                 values *= self._scale[rows, None].astype(np.float32)
         # samples of a pulse outside its band are undefined
-        band = (self.frequency >= self._low[rows, None]) & (self.frequency <= self._high[rows, None])
+        band = (frequency >= self._low[rows, None]) & (frequency <= self._high[rows, None])
         values = np.where(band, values.conj() if self._conjugate else values, np.complex64(0))
-        return np.asarray(values[:, columns], np.complex64)
+        return np.asarray(values, np.complex64)
 
 
 def _mapped(path: Path, fields: dict[str, NDArray[Any]]) -> NDArray[Any]:
